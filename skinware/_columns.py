@@ -32,11 +32,7 @@ def group(owner: npt.NDArray[np.uint32], count: int) -> list[Index]:
 
 
 def column(name: str, data: npt.ArrayLike, code: str) -> npt.NDArray[Any]:
-    """Return a column of a dtype, read-only.
-
-    Raises:
-        StructureError: what is given does not fit; the message says what.
-    """
+    """Return a column of a dtype, read-only, or say in a StructureError what does not fit."""
     wanted = np.dtype(code)
     given = np.asarray(data)
     if given.ndim != 1:
@@ -66,22 +62,14 @@ def frozen(array: npt.NDArray[_T]) -> npt.NDArray[_T]:
 
 
 def same_length(what: str, *columns: npt.NDArray[np.generic]) -> None:
-    """Refuse columns of different lengths.
-
-    Raises:
-        StructureError: the message has the lengths.
-    """
+    """Refuse columns of different lengths."""
     lengths = [len(column) for column in columns]
     if len(set(lengths)) > 1:
         raise StructureError(f"the {what} columns have different lengths: {lengths}")
 
 
 def within(what: str, owner: str, column: npt.NDArray[np.generic], count: int) -> None:
-    """Refuse a row number beyond the table that it is of.
-
-    Raises:
-        StructureError: the message has the row.
-    """
+    """Refuse a row number beyond the table that it is of."""
     if len(column) and int(column.max()) >= count:
         row = int(np.argmax(column))
         raise StructureError(f"{what} {row} belongs to {owner} {column[row]}, but there are only {count}")

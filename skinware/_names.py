@@ -45,11 +45,7 @@ def names_in_patches(own_names: Sequence[str], kinds: Sequence[str], patches: Se
 
 
 def name_in_module(type_name: str, number: int, is_only: bool) -> str:
-    """Return the name of a sensor's place within its module; empty: that of the module says all.
-
-    Args:
-        number: its uid, counted from the lowest in the module.
-    """
+    """Return a sensor's name in its module, by its number from the lowest; empty: that of the module says all."""
     by_type = type_name.startswith(_BY_TYPE)
     if is_only:
         return type_name if by_type else ""

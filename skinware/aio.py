@@ -48,26 +48,9 @@ _LOOK_NS = NS_PER_S
 _LONG_NS = 3600 * NS_PER_S
 
 
-class _Wait:
-    """One coroutine that waits for any of some words to change."""
-
-    def __init__(self, words: Sequence[WakeWord]) -> None:
-        self.words = words
-        self._loop = asyncio.get_running_loop()
-        self.future: asyncio.Future[None] = self._loop.create_future()
-
-    @property
-    def is_over(self) -> bool:
-        return any(word.value != known for word, known in self.words)
-
-    def end(self) -> None:
-        """Let it go on; from any thread."""
-        with contextlib.suppress(RuntimeError):  # its loop was closed
-            self._loop.call_soon_threadsafe(self.finish)
-
-    def finish(self) -> None:
-        if not self.future.done():
-            self.future.set_result(None)
+def _finish(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
 
 
 class Wakeups:
@@ -79,7 +62,7 @@ class Wakeups:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._users = 0
-        self._waits: list[_Wait] = []
+        self._waits: list[tuple[Sequence[WakeWord], asyncio.Future[None]]] = []
         self._watched: set[tuple[int, int]] = set()  # address and value of the words that the thread sleeps on
         memory = np.zeros(4, np.uint8)
         self._changes = memory.view(np.uint32)  # how often there was something new for the thread
@@ -104,10 +87,11 @@ class Wakeups:
 
     async def wait(self, words: Sequence[WakeWord], timeout_s: float) -> None:
         """Come back when one of the words is another than it was, or the time is up; may come back early."""
-        wait = _Wait(words)
-        timer = asyncio.get_running_loop().call_later(timeout_s, wait.finish)
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[None] = loop.create_future()
+        timer = loop.call_later(timeout_s, _finish, future)
         with self._lock:
-            self._waits.append(wait)
+            self._waits.append((words, future))
             is_new = any((word.address, known) not in self._watched for word, known in words)
             self._changes += is_new
             if self._thread is None:
@@ -116,11 +100,11 @@ class Wakeups:
         if is_new:
             self._changed.wake_all()
         try:
-            await wait.future
+            await future
         finally:
             timer.cancel()
             with self._lock:
-                self._waits = [other for other in self._waits if other is not wait]
+                self._waits = [(words, other) for words, other in self._waits if other is not future]
 
     def _run(self) -> None:
         while True:
@@ -138,13 +122,14 @@ class Wakeups:
     def _look(self) -> list[WakeWord]:
         """Wake the coroutines whose words have changed; return what the others wait for, each place once."""
         with self._lock:
-            over = [wait for wait in self._waits if wait.is_over]
-            self._waits = [wait for wait in self._waits if wait not in over]
-            words = {word.address: (word, known) for wait in self._waits for word, known in wait.words}
-            self._watched = {(address, known) for address, (_, known) in words.items()}
-        for wait in over:
-            wait.end()
-        return list(words.values())
+            over = [future for words, future in self._waits if any(word.value != known for word, known in words)]
+            self._waits = [(words, future) for words, future in self._waits if future not in over]
+            waited_for = {word.address: (word, known) for words, _ in self._waits for word, known in words}
+            self._watched = {(address, known) for address, (_, known) in waited_for.items()}
+        for future in over:
+            with contextlib.suppress(RuntimeError):  # its loop was closed
+                future.get_loop().call_soon_threadsafe(_finish, future)
+        return list(waited_for.values())
 
 
 _of_process = Wakeups()

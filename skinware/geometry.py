@@ -147,8 +147,12 @@ class Geometry:
     def at(self, type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
         """Return the places of n sensors; not known where this geometry does not have them."""
         rows = {pair: row for row, pair in enumerate(zip(self.type_name.tolist(), self.uid.tolist(), strict=True))}
-        found = [rows.get(pair, -1) for pair in zip(type_name, uid.tolist(), strict=True)]
-        return self._take(np.array(found, np.int64), type_name, uid)
+        found = np.array([rows.get(pair, -1) for pair in zip(type_name, uid.tolist(), strict=True)], np.int64)
+        known, places = found >= 0, _empty(len(found))
+        places.type_name[:], places.uid[:] = type_name, uid
+        for name in ("position_m", "normal", "radius_m", "confidence", "frame"):
+            getattr(places, name)[known] = getattr(self, name)[found[known]]
+        return places
 
     def __getitem__(self, rows: slice | npt.NDArray[Any]) -> Geometry:
         return Geometry(*(getattr(self, field.name)[rows] for field in dataclasses.fields(self)))
@@ -229,17 +233,6 @@ class Geometry:
             confidence=np.full(n, np.nan),
         )
 
-    def _take(self, rows: npt.NDArray[np.int64], type_name: Sequence[str], uid: npt.NDArray[np.uint64]) -> Geometry:
-        """Return the places of ``rows``; -1: not known."""
-        n = len(rows)
-        taken = _empty(n)
-        known = rows >= 0
-        taken.type_name[:] = type_name
-        taken.uid[:] = uid
-        for name in ("position_m", "normal", "radius_m", "confidence", "frame"):
-            getattr(taken, name)[known] = getattr(self, name)[rows[known]]
-        return taken
-
 
 def read_geometry(path: str | Path) -> Geometry:
     """Read a geometry file.
@@ -263,7 +256,9 @@ def geometry_to_toml(groups: Sequence[GeometryGroup], comment: str = "") -> str:
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     for group in groups:
         lines += ["", "[[group]]"]
-        lines += [f"{key} = {_string(getattr(group, key))}" for key in ("name", "type", "frame") if getattr(group, key)]
+        for key in ("name", "type", "frame"):
+            if text := getattr(group, key):  # JSON escapes as TOML does, but for DEL
+                lines.append(f"{key} = {msgspec.json.encode(text).decode()}".replace("\x7f", "\\u007f"))
         for key in ("radius_m", "confidence"):
             if getattr(group, key) is not None:
                 lines.append(f"{key} = {getattr(group, key)!r}")
@@ -322,8 +317,3 @@ def _empty(n: int) -> Geometry:
 
 def _triples(rows: npt.NDArray[np.float64]) -> tuple[Triple, ...]:
     return tuple((x, y, z) for x, y, z in rows.tolist())
-
-
-def _string(text: str) -> str:
-    """Return a TOML string: what JSON escapes, TOML escapes in the same way (but for DEL)."""
-    return msgspec.json.encode(text).decode().replace("\x7f", "\\u007f")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import zlib
 from dataclasses import dataclass
-from typing import Any, TypeVar, overload
+from typing import TypeVar
 
 import msgspec
 
@@ -53,11 +53,7 @@ class Limits:
     time_ns: int = (1 << 62) - 1
 
     def room(self, size: int) -> int:
-        """Return how many bytes ``size`` bytes may become when they are unpacked.
-
-        Args:
-            size: of the packed data, bytes.
-        """
+        """Return how many bytes so many packed bytes may become."""
         return max(self.always_size, self.ratio * size)
 
     def is_time(self, time_ns: object) -> bool:
@@ -69,25 +65,20 @@ LIMITS = Limits()
 """The limits of all commands, and the default of everything that takes limits."""
 
 
-@overload
-def read_json(data: bytes | memoryview, *, limits: Limits = LIMITS) -> Any: ...
-@overload
-def read_json(data: bytes | memoryview, type_: type[_Type], *, limits: Limits = LIMITS) -> _Type: ...
-def read_json(data: bytes | memoryview, type_: Any = Any, *, limits: Limits = LIMITS) -> Any:
+def read_json(data: bytes | memoryview, type_: type[_Type]) -> _Type:
     """Decode a JSON text that others wrote.
 
     Args:
         data: UTF-8.
-        type_: what it must be, as :mod:`msgspec` has it; default: anything.
-        limits: ``json_size`` and ``json_depth`` apply.
+        type_: what it must be, as :mod:`msgspec` has it.
 
     Raises:
         ValueError: it is no JSON of that type, or is larger or deeper than the limits allow; the message says which.
     """
-    if len(data) > limits.json_size:
-        raise ValueError(f"JSON of {len(data)} bytes; at most {limits.json_size} are read")
-    if _is_deeper(bytes(data), limits.json_depth):
-        raise ValueError(f"JSON nested deeper than {limits.json_depth}")
+    if len(data) > LIMITS.json_size:
+        raise ValueError(f"JSON of {len(data)} bytes; at most {LIMITS.json_size} are read")
+    if _is_deeper(bytes(data), LIMITS.json_depth):
+        raise ValueError(f"JSON nested deeper than {LIMITS.json_depth}")
     try:
         return msgspec.json.decode(data, type=type_)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -95,15 +86,7 @@ def read_json(data: bytes | memoryview, type_: Any = Any, *, limits: Limits = LI
 
 
 def unpack(data: bytes | memoryview, most: int) -> bytes:
-    """Decompress DEFLATE data that others packed.
-
-    Args:
-        data: with zlib's header.
-        most: bytes that it may become.
-
-    Raises:
-        ValueError: it cannot be decompressed, is incomplete, or becomes larger.
-    """
+    """Decompress zlib's data that others packed; ValueError if they are broken or become larger than this."""
     unpacker = zlib.decompressobj()
     try:
         unpacked = unpacker.decompress(data, most + 1)

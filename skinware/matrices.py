@@ -76,8 +76,12 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
             StructureError: no such module, several of that name, or it is no matrix of these sensors.
         """
         known = [key] if key in self._kind_of else self._keys_of.get(str(key), [])
-        if len(known) != 1:
-            raise _NotHere(self._which(key, known))
+        if not known:
+            more = f" ... ({len(self)} in all)" if len(self) > _MOST_NAMES else ""
+            there_are = ", ".join(map(repr, list(self)[:_MOST_NAMES])) or "none"
+            raise _NotHere(f"no module {key!r} here; matrices of {self._type_name}: {there_are}{more}")
+        if len(known) > 1:
+            raise _NotHere(f"several drivers have a module {key!r}; say which: {', '.join(map(repr, known))}")
         (one,) = known
         if one not in self._matrices:
             kind = self._kind_of[one]
@@ -91,10 +95,3 @@ class Matrices(Mapping[Key, npt.NDArray[np.int64]]):
 
     def __len__(self) -> int:
         return len(self._matrices)
-
-    def _which(self, key: Key | str, known: Sequence[Key]) -> str:
-        if known:
-            return f"several drivers have a module {key!r}; say which: {', '.join(map(repr, known))}"
-        more = f" ... ({len(self)} in all)" if len(self) > _MOST_NAMES else ""
-        there_are = ", ".join(map(repr, list(self)[:_MOST_NAMES])) or "none"
-        return f"no module {key!r} here; matrices of {self._type_name}: {there_are}{more}"

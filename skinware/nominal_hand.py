@@ -67,11 +67,7 @@ def side_of(frame: str) -> Side | None:
 
 
 def parts_at(position_m: npt.NDArray[np.float64], side: Side) -> npt.NDArray[np.int64]:
-    """Return (n,) the number in ``PARTS`` of the part on which each place of a hand's frame is.
-
-    Args:
-        position_m: (n, 3).
-    """
+    """Return (n,) the numbers in ``PARTS`` of the parts on which places of a hand's frame, (n, 3), are."""
     at = position_m[:, :2] * [1 if side == "right" else -1, 1]
     away = np.empty((len(PARTS), len(at)))
     for number, part in enumerate(PARTS.values()):

@@ -216,13 +216,6 @@ def set_cpus(cpus: Collection[int]) -> Refusal | None:
     return Refusal(f"CPUs {cpus_as_text(cpus)}", why, "choose among these, or widen that set")
 
 
-def set_timer_slack(slack_ns: int) -> None:
-    """Return how late timers of this thread may be; a SCHED_FIFO thread has none, whatever is set."""
-    if _libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) != 0:
-        number = ctypes.get_errno()
-        raise OSError(number, os.strerror(number))
-
-
 def _limits_line(limit: str) -> str:
     try:
         name = pwd.getpwuid(os.getuid()).pw_name
@@ -379,7 +372,9 @@ class Profile:
         answers.append(lock_memory() if self.lock_memory else None)
         answers.append(set_policy(self.priority))
         if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:  # which has none in any case
-            set_timer_slack(self.timer_slack_ns)  # after the policy, whose change resets it
+            slack = ctypes.c_ulong(self.timer_slack_ns)  # after the policy, whose change resets it
+            if _libc.prctl(_PR_SET_TIMERSLACK, slack, 0, 0, 0) != 0:
+                raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
         refusals = tuple(answer for answer in answers if answer is not None)
         if refusals and strict:
             raise RealtimeRefused("\n".join(str(refusal) for refusal in refusals))

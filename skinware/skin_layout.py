@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -17,12 +17,6 @@ from skinware.structure import Structure
 from skinware.text import nearest_name
 
 
-def _module_keys(driver: str, structure: Structure) -> list[ModuleKey]:
-    patches = structure.module_patch.tolist()
-    names = _names.names_in_patches(texts(structure.module_name), texts(structure.module_kind), patches)
-    return [(driver, structure.patch_names[patch], name) for patch, name in zip(patches, names, strict=True)]
-
-
 @dataclass(frozen=True, eq=False)
 class SkinLayout:
     """Which drivers the skin consists of. It never changes; if a driver joins or leaves, there is a new one.
@@ -34,6 +28,8 @@ class SkinLayout:
 
     drivers: tuple[str, ...]
     structures: tuple[Structure, ...]
+    _matrices: dict[str, Matrices[ModuleKey]] = field(default_factory=dict, init=False, repr=False)
+    _by_uid: dict[str, dict[int, list[int]]] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def types(self) -> tuple[str, ...]:
@@ -157,15 +153,15 @@ class SkinLayout:
         """
         module_of = self.module_of(type_name)
         if type_name not in self._matrices:
-            keys = [key for pair in zip(self.drivers, self.structures, strict=True) for key in _module_keys(*pair)]
+            keys: list[ModuleKey] = []
+            for driver, structure in zip(self.drivers, self.structures, strict=True):
+                patches = structure.module_patch.tolist()
+                own = _names.names_in_patches(texts(structure.module_name), texts(structure.module_kind), patches)
+                keys += [(driver, structure.patch_names[of], name) for of, name in zip(patches, own, strict=True)]
             kinds = [kind for structure in self.structures for kind in texts(structure.module_kind)]
             names = [name for structure in self.structures for name in structure.module_names]
             self._matrices[type_name] = Matrices(type_name, keys, kinds, module_of, names)
         return self._matrices[type_name]
-
-    @cached_property
-    def _matrices(self) -> dict[str, Matrices[ModuleKey]]:
-        return {}
 
     def geometry(self, type_name: str) -> Geometry:
         """Return where every sensor of a type is, in the same order; not known where its driver does not publish it.
@@ -192,7 +188,11 @@ class SkinLayout:
         Raises:
             StructureError: there is none, or several drivers have one.
         """
-        found = self._positions(type_name).get(uid, [])
+        if type_name not in self._by_uid:
+            positions = self._by_uid[type_name] = {}
+            for position, own in enumerate(self.uids(type_name).tolist()):
+                positions.setdefault(own, []).append(position)
+        found = self._by_uid[type_name].get(uid, [])
         if driver is not None:
             of = self.driver_of(type_name)
             found = [position for position in found if self.drivers[of[position]] == driver]
@@ -203,18 +203,6 @@ class SkinLayout:
             raise StructureError(f"no {type_name!r} sensor with uid {uid:#x}{whose} in this skin")
         names = ", ".join(self.drivers[self.driver_of(type_name)[position]] for position in found)
         raise StructureError(f"several drivers have a {type_name!r} sensor with uid {uid:#x}: {names}; say which")
-
-    def _positions(self, type_name: str) -> dict[int, list[int]]:
-        if type_name not in self._by_uid:
-            positions: dict[int, list[int]] = {}
-            for position, uid in enumerate(self.uids(type_name).tolist()):
-                positions.setdefault(uid, []).append(position)
-            self._by_uid[type_name] = positions
-        return self._by_uid[type_name]
-
-    @cached_property
-    def _by_uid(self) -> dict[str, dict[int, list[int]]]:
-        return {}
 
     def __repr__(self) -> str:
         sensors = sum(structure.n_sensors for structure in self.structures)

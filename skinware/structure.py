@@ -205,6 +205,10 @@ class Structure:
         return {}
 
     @cached_property
+    def _matrices(self) -> dict[str, Matrices[str]]:
+        return {}
+
+    @cached_property
     def _index_by_type(self) -> dict[str, Index]:
         return {t.name: as_index(np.flatnonzero(self.sensor_type == t.id)) for t in self.types}
 
@@ -349,10 +353,6 @@ class Structure:
         if type_name not in self._matrices:
             self._matrices[type_name] = Matrices(type_name, self.module_names, texts(self.module_kind), module_of)
         return self._matrices[type_name]
-
-    @cached_property
-    def _matrices(self) -> dict[str, Matrices[str]]:
-        return {}
 
     def physical(self, values: npt.NDArray[np.generic], type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Physical values of all sensors of a type.

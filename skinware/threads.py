@@ -18,7 +18,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy.typing as npt
 
@@ -37,12 +37,6 @@ T = TypeVar("T")
 F = TypeVar("F", bound=Sample)
 
 
-class _Stoppable(Protocol):
-    def stop(self) -> None: ...
-
-    def close(self) -> None: ...
-
-
 class Worker(Generic[T]):
     """A thread that calls a function repeatedly.
 
@@ -57,7 +51,7 @@ class Worker(Generic[T]):
     def __init__(
         self,
         name: str,
-        owned: _Stoppable,
+        owned: ServiceReader[Any] | Writer | Skin,
         items: Callable[[], Iterator[T]],
         function: Callable[[T], object],
         profile: Profile | None = None,

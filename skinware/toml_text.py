@@ -26,14 +26,7 @@ _WHERE = re.compile(r" \(at (?:line (\d+), column \d+|end of document)\)$")
 
 
 class TomlText:
-    """A TOML file as it is now.
-
-    Args:
-        path: of the file; None: one that says nothing.
-
-    Raises:
-        ConfigurationError: it cannot be read, or is not TOML.
-    """
+    """A TOML file as it is now, or none; refuse what cannot be read, or is not TOML."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path

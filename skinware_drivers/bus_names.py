@@ -10,6 +10,7 @@ from skinware.errors import ConfigurationError
 
 _PLACING: dict[str, dict[str, str]] = {
     "replay": {"bus": "", "driver": ""},
+    "file": {"bus": "", "driver": ""},
     "serial": {"serial_number": "", "vid_pid": ""},
     "udp_multicast": {"port": "43113"},
     "socketcand": {"host": "", "port": ""},

@@ -1,15 +1,13 @@
 """Run commands: exit statuses, one clear line for each error, and the options that several commands have.
 
-A command is a module with a click command and::
-
-    def main() -> None:
-        cli.run(command)
+A command is a module with a click command and ``main = partial(cli.run, command)``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
+import logging
 import math
 import os
 import signal
@@ -41,11 +39,7 @@ FILE = click.Path(path_type=Path)
 
 
 def seconds(text: str) -> float:
-    """Return a time in seconds, 0 or more and finite; for ``click.option(type=...)``.
-
-    Raises:
-        click.BadParameter: the text is no such number.
-    """
+    """Return a time in seconds, 0 or more and finite; for ``click.option(type=...)``."""
     try:
         number = float(text)
     except ValueError:
@@ -67,13 +61,15 @@ def command(
     context_settings: Mapping[str, Any] | None = None,
     **more: Any,
 ) -> Callable[[Callable[..., Any]], click.Command]:
-    """Make a command of a function, with ``-h``, ``--version``, and these examples in its help.
-
-    Args:
-        more: further arguments of ``click.command``.
-    """
+    """Make a command of a function, with ``-h``, ``--version``, these examples in its help, and arguments of click."""
     settings = {**CONTEXT_SETTINGS, **(context_settings or {})}
     made = click.command(name, cls, context_settings=settings, epilog=examples(*lines), **more)
+    return lambda function: version_option(made(function))
+
+
+def group(name: str) -> Callable[[Callable[..., Any]], click.Group]:
+    """Make a group of commands of a function, with ``-h`` and ``--version``."""
+    made = click.group(name, context_settings=CONTEXT_SETTINGS)
     return lambda function: version_option(made(function))
 
 
@@ -102,12 +98,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON f
 group_option = click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
 driver_option = click.option("--driver", metavar="DRIVER", help="Driver to read, if several run.")
 verbose_option = click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")
-tls_option = click.option(
-    "--tls",
-    metavar="DIR",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Encrypt; DIR has ca.pem, cert.pem and key.pem.",
-)
+names_argument = click.argument("names", metavar="[NAME]...", nargs=-1)
 caller_option = click.option(
     "--caller",
     "callers",
@@ -116,13 +107,29 @@ caller_option = click.option(
     help="Only certificates of this name may call operations (tare ...); may be repeated.",
 )
 insecure_option = click.option("--insecure", is_flag=True, help="Listen beyond this machine without --tls.")
-regions_option = click.option(
-    "--regions",
-    "region_files",
-    metavar="FILE",
-    multiple=True,
-    type=FILE,
-    help=f"File with regions; may be repeated.  [default with --region: {DEFAULT_REGIONS}]",
+
+
+def tls_option(what: str = "Encrypt; DIR has ca.pem, cert.pem and key.pem.") -> Callable[[_Decorated], _Decorated]:
+    folder = click.Path(path_type=Path, file_okay=False)
+    return click.option("--tls", metavar="DIR", type=folder, help=what)
+
+
+def links_option(what: str) -> Callable[[_Decorated], _Decorated]:
+    return click.option("--links", metavar="FILE", type=FILE, help=what)
+
+
+def regions_option(
+    what: str = f"File with regions; may be repeated.  [default with --region: {DEFAULT_REGIONS}]",
+) -> Callable[[_Decorated], _Decorated]:
+    return click.option("--regions", "region_files", metavar="FILE", multiple=True, type=FILE, help=what)
+
+
+parts_options = options(
+    click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; may be repeated."),
+    click.option(
+        "--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; may be repeated."
+    ),
+    regions_option(),
 )
 
 
@@ -133,11 +140,6 @@ def type_option(what: str) -> Callable[[_Decorated], _Decorated]:
 def duration_option(what: str = "End after SECONDS.") -> Callable[[_Decorated], _Decorated]:
     """``-T SECONDS``: the command ends by itself after this time."""
     return click.option("-T", "duration_s", metavar="SECONDS", type=seconds, help=what)
-
-
-def timeout_option(what: str) -> Callable[[_Decorated], _Decorated]:
-    """``-T SECONDS`` or ``--timeout SECONDS``: the command fails after this time without what it waits for."""
-    return click.option("-T", "--timeout", "timeout_s", metavar="SECONDS", type=seconds, help=what)
 
 
 def output_option(
@@ -159,11 +161,7 @@ def output_option(
 
 
 def regions_of(files: Sequence[Path], names: Collection[str] = ()) -> Regions:
-    """Return the regions of files, or of the default file.
-
-    Raises:
-        ConfigurationError: a file cannot be read, or a region is missing.
-    """
+    """Return the regions of files, or of the default file; refuse names of others."""
     from skinware.tactile.regions import read_regions, unknown
 
     regions = read_regions(*(files or (DEFAULT_REGIONS,)))
@@ -173,12 +171,7 @@ def regions_of(files: Sequence[Path], names: Collection[str] = ()) -> Regions:
 
 
 def regions_asked_for(names: Collection[str], files: Sequence[Path]) -> Regions:
-    """Return the regions of files if some are named, otherwise none.
-
-    Raises:
-        click.UsageError: there are files but no names.
-        ConfigurationError: as :func:`regions_of`.
-    """
+    """Return the regions of files if some are named, otherwise none; refuse files without names."""
     from skinware.tactile.regions import Regions
 
     if files and not names:
@@ -187,14 +180,7 @@ def regions_asked_for(names: Collection[str], files: Sequence[Path]) -> Regions:
 
 
 def refuse_others(option: str, allowed: Collection[str]) -> None:
-    """Refuse what is given on the command line and does not go with an option.
-
-    Args:
-        allowed: names of the parameters that go with it.
-
-    Raises:
-        click.UsageError: another one was given.
-    """
+    """Refuse what is given on the command line and is not among the parameters that go with an option."""
     context = click.get_current_context()
     for parameter in context.command.params:
         name = parameter.name or ""
@@ -218,8 +204,6 @@ def echo_changes(shown: dict[str, str], states: Mapping[str, str]) -> None:
 
 
 def log_to_stderr(verbose: bool) -> None:
-    import logging
-
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(Formatter(f"{click.get_current_context().info_name}: %(message)s"))
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
@@ -229,12 +213,7 @@ def log_to_stderr(verbose: bool) -> None:
 def signals_end(
     stop: Callable[[], object], others: Mapping[signal.Signals, Callable[[], object]] | None = None
 ) -> Iterator[None]:
-    """End the block in good order on SIGINT and SIGTERM.
-
-    Args:
-        stop: called by them, in the main thread.
-        others: called by other signals.
-    """
+    """Let SIGINT and SIGTERM call ``stop`` in the main thread, which ends the block; and other signals other things."""
     calls = {signal.SIGINT: stop, signal.SIGTERM: stop, **(others or {})}
     before = {number: signal.signal(number, lambda *_, call=call: call()) for number, call in calls.items()}
     try:
@@ -252,11 +231,7 @@ def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     Args:
         goes_on: its work goes on while its output is not read; by default it waits for the reader, as ``| less`` needs.
     """
-
-    def interrupt(_signal: int, _frame: object) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, interrupt)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with patient_output() if goes_on else contextlib.nullcontext():
         status = exit_status(command, sys.argv[1:])
     sys.exit(status)

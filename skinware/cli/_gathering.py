@@ -1,27 +1,37 @@
-"""Gather presses or strokes for skin-calibrate, and show the coverage and the faults of a geometry."""
+"""Gather presses or strokes for skin-calibrate; read its layouts, write its places, and show what it found."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import numpy.typing as npt
 
 from skinware.cli import _command as cli
-from skinware.cli._heat_map import arrange
-from skinware.cli._terminal import echo, print_json, terminal_width
+from skinware.cli._heat_map import BACKGROUND, arrange
+from skinware.cli._terminal import are_terminals, echo, print_json, say, terminal_width
 from skinware.driver_service import DriverReader
+from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry, geometry_to_toml, read_geometry
+from skinware.memory.namespace import Namespace
+from skinware.service import ServiceReader
 from skinware.structure import Structure
 from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED, TURNED, UNKNOWN, Finding
+from skinware.tactile.calibration.placing import Placement
+from skinware.tactile.calibration.results import placed_comment, placed_groups
+from skinware.tactile.calibration.shapes import Shape, shapes_of
 from skinware.tactile.calibration.sources import ForceSource, LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
 from skinware.text import plural
-from skinware.views.live import after, enter_pressed, frames_until
+from skinware.views.live import after, enter_pressed, frames_until, reader_of
 
 SIGNS = "·▂▃▄▅▆▇█"
 """Signs of sensors from nothing to all that is wanted."""
@@ -30,11 +40,7 @@ _HEIGHT = 40
 
 
 def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]) -> Iterator[str]:
-    """Yield a line for each patch: its name, a bar, and how many of its sensors have all that is wanted.
-
-    Args:
-        coverage: (n,) 0 to 1 for each sensor.
-    """
+    """Yield a line for each patch: its name, a bar, and how many of its sensors have all that is wanted."""
     patch = structure.patch_of(type_name)
     width = max(map(len, structure.patch_names))
     for number, name in enumerate(structure.patch_names):
@@ -45,20 +51,16 @@ def bars(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64]
 
 
 def picture(structure: Structure, type_name: str, coverage: npt.NDArray[np.float64], width: int) -> Iterator[str]:
-    """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage.
-
-    Args:
-        coverage: (n,) 0 to 1 for each sensor.
-    """
+    """Yield lines with the sensors, module by module as in ``skin-top``, each as the sign of its coverage, 0 to 1."""
     drawn = arrange(structure, list(range(structure.n_patches)), type_name, width, _HEIGHT, smallest=2)
     of_sensor = np.zeros(structure.n_sensors)
     of_sensor[structure.index(type_name)] = coverage
     level = np.where(of_sensor >= 1, len(SIGNS) - 1, np.ceil(of_sensor * (len(SIGNS) - 2)))
-    codes = level.astype(np.uint8)[drawn.sensors]
-    pixels = np.append(codes, np.uint8(len(SIGNS)))[drawn.pixels]
+    pixels = drawn.draw(level.astype(np.uint8)[drawn.sensors])
     for number in range(drawn.lines):
         upper, lower = pixels[2 * number : 2 * number + 2]
-        signs = [(SIGNS + " ")[code] for code in np.where(upper == len(SIGNS), lower, upper).tolist()]
+        codes = np.where(upper == BACKGROUND, lower, upper).tolist()
+        signs = [" " if code == BACKGROUND else SIGNS[code] for code in codes]
         for label in drawn.labels.get(number, ()):
             signs[label.column : label.column + len(label.text)] = label.text
         yield "".join(signs).rstrip()
@@ -98,20 +100,28 @@ def _sensors(finding: Finding, structure: Structure, type_name: str) -> npt.NDAr
     return sensors
 
 
+_POSES_TIMEOUT_S = 5.0
 _REPORT_EVERY_S = 1.0
 _SAVE_EVERY_S = 10.0
 _WIDTH = 100
 
 
+@dataclass(frozen=True)
+class GatheringOptions:
+    """The options of all commands that gather."""
+
+    driver: str | None
+    type_name: str | None
+    share: float
+    duration_s: float | None
+    state: Path | None
+    fresh: bool
+    namespace: str | None
+    as_json: bool
+
+
 class Gathering:
-    """Take the snapshots of a driver into a session, and report the progress.
-
-    Args:
-        fresh: begin with nothing, and ignore that file.
-
-    Raises:
-        ConfigurationError: the data of the state file do not fit.
-    """
+    """Take the snapshots of a driver into a session, and report the progress."""
 
     def __init__(
         self,
@@ -133,59 +143,48 @@ class Gathering:
         self._reported = -1.0
 
     def run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
-        """Gather until enough sensors have all that is wanted, for a time, or until Enter.
-
-        Gathered data are in the state file afterwards, also after Ctrl-C.
-
-        Args:
-            share: part of the sensors that is enough, 0 to 1.
-            duration_s: longest time after the baselines are known; None: no limit.
-
-        Raises:
-            ServiceTimeout: the driver is silent.
-            KeyboardInterrupt: Ctrl-C.
-        """
+        """Gather until a share of the sensors has all that is wanted, for a time, or until Enter."""
+        gathers = duration_s is None or duration_s > 0
         with self._kept():
-            self._run(what_to_do, share, duration_s)
-            self._report_coverage()
+            if gathers:
+                self._wait_for_rest()
+            if self._as_json:
+                what = {"driver": self._reader.name, "type": self.type_name, "restored": self.restored}
+                print_json({"event": "ready", **what, **self._figures()})
+            else:
+                echo(f"continuing with the data in {self._state_path}\n" * self.restored + what_to_do)
+            if gathers:
+                self._gather(share, duration_s)
+        if not self._as_json:
+            self._show_coverage()
 
     def weigh(self, weight_n: float, duration_s: float, source: ForceSource) -> None:
-        """Ask for a known weight, and gather while it rests. Baselines are measured before, and followed until Enter.
-
-        Args:
-            weight_n: the weight, N.
-            duration_s: how long it rests.
-            source: pairs it with the temperature.
-
-        Raises:
-            ServiceTimeout: the driver is silent.
-            KeyboardInterrupt: Ctrl-C.
-        """
+        """Ask for a known weight, and gather while it rests. Baselines are followed until Enter."""
         with self._kept():
             self._wait_for_rest()
             echo(f"lay {weight_n:g} N on the skin, and press Enter", err=True)
-            if sys.stdin is not None and sys.stdin.isatty():
+            if are_terminals(sys.stdin):
                 for frame in frames_until(self._reader, enter_pressed):
                     self.source.loads(frame)
             source.weight_n, time_is_over = weight_n, after(duration_s)
             felt = np.zeros(len(self._uid), bool)
-            try:
-                for frame in frames_until(self._reader, time_is_over):
-                    loads = self.source.loads(frame)
-                    self._session.take(frame.acquired_ns, loads, source.newest())
-                    felt |= loads > 0
-            finally:
-                self._save()
-            if not felt.any():
-                cli.warn(f"no sensor felt {weight_n:g} N: it does not count")
-            elif not self._as_json:
-                echo(f"{weight_n:g} N: {plural(int(felt.sum()), 'sensor')} felt it")
+            for frame in frames_until(self._reader, time_is_over):
+                loads = self.source.loads(frame)
+                self._session.take(frame.acquired_ns, loads, source.newest())
+                felt |= loads > 0
+        if not felt.any():
+            cli.warn(f"no sensor felt {weight_n:g} N: it does not count")
+        elif not self._as_json:
+            echo(f"{weight_n:g} N: {plural(int(felt.sum()), 'sensor')} felt it")
 
     @contextmanager
     def _kept(self) -> Iterator[None]:
-        """Say on Ctrl-C where the gathered data are."""
+        """Save the gathered data at the end of the block, and say on Ctrl-C where they are."""
         try:
-            yield
+            try:
+                yield
+            finally:
+                self._save()
         except KeyboardInterrupt:
             if self._as_json:
                 print_json({"event": "interrupted", "state": str(self._state_path), **self._figures()})
@@ -193,10 +192,8 @@ class Gathering:
                 echo(f"\nthe gathered data are in {self._state_path}; the same command continues with them")
             raise
 
-    def _report_coverage(self) -> None:
-        """Show the coverage of each patch to people, and a picture of the skin."""
-        if self._as_json:
-            return
+    def _show_coverage(self) -> None:
+        """Show the coverage of each patch, and a picture of the skin."""
         structure, type_name, coverage = self.structure, self.type_name, self._session.coverage
         for line in bars(structure, type_name, coverage):
             echo(line)
@@ -204,17 +201,6 @@ class Gathering:
         for line in picture(structure, type_name, coverage, min(terminal_width() or _WIDTH, _WIDTH)):
             echo(line)
         echo(f"\n{SIGNS[0]} nothing   {SIGNS[1]} to {SIGNS[-2]} some   {SIGNS[-1]} all that is wanted")
-
-    def _run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
-        gathers = duration_s is None or duration_s > 0
-        try:
-            if gathers:
-                self._wait_for_rest()
-            self._report_ready(what_to_do)
-            if gathers:
-                self._gather(share, duration_s)
-        finally:
-            self._save()
 
     def _gather(self, share: float, duration_s: float | None) -> None:
         time_is_over = after(math.inf if duration_s is None else duration_s)
@@ -248,15 +234,6 @@ class Gathering:
         coverage = self._session.coverage
         return {**self._session.figures, "sensors": len(coverage), "covered": int((coverage >= 1).sum())}
 
-    def _report_ready(self, what_to_do: str) -> None:
-        if self._as_json:
-            what = {"driver": self._reader.name, "type": self.type_name, "restored": self.restored}
-            print_json({"event": "ready", **what, **self._figures()})
-            return
-        if self.restored:
-            echo(f"continuing with the data in {self._state_path}")
-        echo(what_to_do)
-
     def _report_progress(self) -> None:
         structure, coverage = self.structure, self._session.coverage
         figures = self._figures()
@@ -274,3 +251,62 @@ class Gathering:
             self._reported = mean
             gathered = ", ".join(f"{count} {name}" for name, count in self._session.figures.items())
             echo(f"{gathered}: {figures['covered']} of {figures['sensors']} sensors have enough")
+
+
+@contextmanager
+def opened(
+    file: Path,
+    session_of: Callable[[int], Any],
+    how: GatheringOptions,
+    poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
+) -> Iterator[tuple[Gathering, Any]]:
+    """Yield a gathering, with driver and poses open, and its session."""
+    with ExitStack() as stack:
+        reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))
+        source = LoadSource(reader.structure, reader.driver_type, how.type_name)
+        pose_source = None
+        if poses is not None:
+            service, poses_namespace, column, shape = poses
+            place = Namespace(poses_namespace or how.namespace)
+            pose_reader = stack.enter_context(ServiceReader(service, namespace=place, timeout_s=_POSES_TIMEOUT_S))
+            pose_source = PoseSource(pose_reader, column, shape)
+        state_path = how.state or file.with_name(f"{file.name}.state.npz")
+        session = session_of(len(reader.structure.module_of(source.type_name)))
+        gathering = Gathering(reader, session, source, pose_source, state_path, fresh=how.fresh, as_json=how.as_json)
+        yield gathering, session
+
+
+def places_in_frame(places: Geometry, frame: str) -> tuple[npt.NDArray[np.float64], bool]:
+    """Places in the coordinate frame ``frame``, or else in the one with the most places; whether it is that frame."""
+    frames = Counter(places.frame[places.known].tolist())
+    here = frame if frame in frames else max(frames, key=lambda name: frames[name])
+    return np.where((places.frame == here)[:, None], places.position_m, np.nan), here == frame
+
+
+def read_layout(structure: Structure, type_name: str, layout: Path) -> tuple[Geometry, Mapping[int, Shape]]:
+    """Return the places of sensors in a file, and the shapes of the modules that have places there."""
+    places = read_geometry(layout).of(structure, type_name)
+    kinds = [bytes(kind).decode() for kind in structure.module_kind.tolist()]
+    shapes = shapes_of(structure.module_of(type_name), kinds, places.position_m, places.normal)
+    if not shapes:
+        raise ConfigurationError(f"{layout}: no whole module of this driver has places in it")
+    return places, shapes
+
+
+def write_places(file: Path, gathering: Gathering, placement: Placement, frame: str, pitch_m: float) -> None:
+    structure, type_name = gathering.structure, gathering.type_name
+    if not placement.known.any():
+        raise click.ClickException("no sensor was pressed often enough; nothing is written")
+    groups = placed_groups(structure, type_name, placement, frame, pitch_m)
+    file.write_text(geometry_to_toml(groups, placed_comment(structure, type_name, placement)), encoding="utf-8")
+
+
+def report_placed(as_json: bool, file: Path, placement: Placement, also: Mapping[str, Any], words: str) -> None:
+    known, wrong = int(placement.known.sum()), int(placement.wrong.sum())
+    tool, residual_mm = placement.tool, 1e3 * placement.spread_m
+    figures = {"placed": known, "wrong": wrong, "residual_m": round(placement.spread_m, 6)}
+    of_tool = {"corrected": tool.found, "doubts": tool.doubts, "unchecked_m": tool.unchecked}
+    text = f"{file}: {known} sensors placed, {wrong} presses left out, residual {residual_mm:.1f} mm{words}"
+    text = "\n".join([text, *tool.words()])
+    say(as_json, {"event": "done", "file": str(file), **figures, **of_tool, **also}, text)
+    click.get_current_context().exit(cli.EXIT_FAILED if tool.doubts else cli.EXIT_DONE)

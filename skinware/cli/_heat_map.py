@@ -28,18 +28,7 @@ BACKGROUND = 255
 _HOLD = 0.75
 """A level stays while the value is within this many levels of its middle, so that noise on an edge does not flicker."""
 _LABEL_ROOM = 2
-_SIZES = (
-    (8, _LABEL_ROOM),
-    (8, 0),
-    (6, _LABEL_ROOM),
-    (6, 0),
-    (4, _LABEL_ROOM),
-    (4, 0),
-    (2, _LABEL_ROOM),
-    (2, 0),
-    (1, _LABEL_ROOM),
-    (1, 0),
-)
+_SIZES = tuple((zoom, room) for zoom in (8, 6, 4, 2, 1) for room in (_LABEL_ROOM, 0))
 """Zooms, and pixels above a block for the name of its module; the first that fits is used."""
 _LONGEST_NAME = 16
 _NAMES_FROM_WIDTH = 48
@@ -58,11 +47,7 @@ _MARK_OF = np.array([next((m for m, bit in _MARK_BITS if status & bit), FRESH) f
 
 
 def marks_of(status: npt.NDArray[np.uint8], settling: npt.NDArray[np.bool_]) -> npt.NDArray[np.uint8]:
-    """Return (n,) uint8, the mark of each sensor.
-
-    Args:
-        settling: (n,) bool: those never seen only as their baselines are not known yet.
-    """
+    """Return (n,) uint8, the mark of each sensor; ``settling`` ones were seen, and wait for baselines."""
     marks: npt.NDArray[np.uint8] = _MARK_OF[status]
     marks[settling & (marks == NEVER_SEEN)] = SETTLING
     return marks
@@ -71,14 +56,7 @@ def marks_of(status: npt.NDArray[np.uint8], settling: npt.NDArray[np.bool_]) -> 
 def levels_of(
     values: npt.NDArray[np.float32], low: float, high: float, before: npt.NDArray[np.uint8] | None = None
 ) -> npt.NDArray[np.uint8]:
-    """Return (n,) uint8, 0 to 15: where values lie between ``low`` and ``high``.
-
-    Args:
-        values: (n,) physical values.
-        low: value of level 0.
-        high: value of level 15.
-        before: the levels drawn so far, which stay while they are nearly right.
-    """
+    """Return (n,) uint8, 0 to 15: where values lie; levels ``before`` stay while they are nearly right."""
     span = high - low if high > low else 1.0
     exact = np.clip(np.nan_to_num((values - low) / span), 0.0, 1.0) * LEVELS
     levels: npt.NDArray[np.uint8] = np.minimum(exact, LEVELS - 1).astype(np.uint8)
@@ -134,11 +112,7 @@ class Arrangement:
         return np.append(codes, np.uint8(BACKGROUND))[self.pixels]  # pixel -1 is the last one
 
     def limited(self, only: npt.NDArray[np.bool_]) -> Arrangement:
-        """Return the same picture without the other sensors.
-
-        Args:
-            only: (n_sensors,) bool, the sensors of a snapshot that stay.
-        """
+        """Return the same picture with some of its sensors, (n_sensors,) bool."""
         stays = only[self.sensors]
         number = np.append(np.where(stays, np.cumsum(stays) - 1, -1), -1)  # pixel -1 is the last one
         return Arrangement(self.sensors[stays], number[self.pixels], self.labels, self.zoom)
@@ -171,9 +145,6 @@ def arrange(
         patches: to draw; several are drawn below each other with their names.
         smallest: pixels along the side of the smallest sensor: 1, or 2 where each needs a whole character.
         only: (n_sensors,) bool, sensors of a region; other sensors are left out, and modules without any of these.
-
-    Raises:
-        StructureError: there is no such type.
     """
     wanted = np.zeros(structure.n_sensors, bool)
     wanted[structure.index(type_name)] = True

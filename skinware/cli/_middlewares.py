@@ -15,12 +15,8 @@ from skinware.cli._terminal import echo, print_json, say
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from skinware.ros2.serving import Ros2Server
-    from skinware.ros2.transport import Node, NodeIdentity
+    from skinware.ros2.transport import Node
     from skinware.yarp.names import NameServer
-    from skinware.yarp.serving import YarpServer
 
 
 @click.command(
@@ -31,7 +27,7 @@ if TYPE_CHECKING:
         "skin-bridge ros2 arm --domain 7 --ros-namespace /icub  /icub/skin/arm/points/pressure ... in domain 7",
     ),
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @click.option(
     "--rmw",
     type=click.Choice(["dds", "zenoh"]),
@@ -117,7 +113,30 @@ def ros2(
         check_name(name, "driver")
     place = Namespace(namespace)
     identity = NodeIdentity(f"skinware_{in_topic(place.name)}", ros_namespace, domain, Distro(distro))
-    with contextlib.closing(_node(rmw, identity, connect, interfaces, _router_report(as_json))) as node:
+    shown: dict[str, str] = {}
+
+    def report_router(is_there: bool, line: str) -> None:
+        if as_json:
+            print_json({"event": "router", "is_there": is_there, "why": line})
+        else:
+            (echo if is_there else cli.warn)(line)
+
+    def report() -> None:
+        drivers = server.drivers()
+        if as_json:
+            print_json({"event": "status", "drivers": {name: asdict(driver) for name, driver in drivers.items()}})
+        else:
+            cli.echo_changes(shown, {name: driver.state for name, driver in drivers.items()})
+
+    if rmw == "zenoh":
+        from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
+
+        node: Node = ZenohNode(identity, connect=connect or (ROUTER,), router_changed=report_router)
+    else:
+        from skinware.ros2.dds import DdsNode
+
+        node = DdsNode(identity, interfaces)
+    with contextlib.closing(node):
         server = Ros2Server(
             node,
             place,
@@ -132,46 +151,7 @@ def ros2(
             where = f"{identity.prefix}/{identity.name}"
             ready = {"event": "ready", "rmw": rmw, "domain": domain, "node": where, "namespace": place.name}
             say(as_json, ready, f"node {where} in domain {domain} of ROS 2: namespace {place.name!r} (Ctrl-C ends)")
-            server.run(_topics_status(server, as_json))
-
-
-def _node(
-    rmw: str,
-    identity: NodeIdentity,
-    connect: tuple[str, ...],
-    interfaces: tuple[str, ...],
-    router_changed: Callable[[bool, str], None],
-) -> Node:
-    if rmw == "zenoh":
-        from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
-
-        return ZenohNode(identity, connect=connect or (ROUTER,), router_changed=router_changed)
-    from skinware.ros2.dds import DdsNode
-
-    return DdsNode(identity, interfaces)
-
-
-def _router_report(as_json: bool) -> Callable[[bool, str], None]:
-    def report(is_there: bool, line: str) -> None:
-        if as_json:
-            print_json({"event": "router", "is_there": is_there, "why": line})
-        else:
-            (echo if is_there else cli.warn)(line)
-
-    return report
-
-
-def _topics_status(server: Ros2Server, as_json: bool) -> Callable[[], None]:
-    shown: dict[str, str] = {}
-
-    def report() -> None:
-        drivers = server.drivers()
-        if as_json:
-            print_json({"event": "status", "drivers": {name: asdict(driver) for name, driver in drivers.items()}})
-            return
-        cli.echo_changes(shown, {name: driver.state for name, driver in drivers.items()})
-
-    return report
+            server.run(report)
 
 
 @click.command(
@@ -182,7 +162,7 @@ def _topics_status(server: Ros2Server, as_json: bool) -> Callable[[], None]:
         "skin-bridge yarp --yarp 4 --server 10.0.0.1:10000 --listen 10.0.0.7   for a robot's network",
     ),
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @click.option("--prefix", default="/skinware", show_default=True, metavar="/P", help="Prefix of all port names.")
 @click.option("--type", "type_name", default="pressure", show_default=True, metavar="TYPE", help="Sensor type.")
 @click.option(
@@ -191,14 +171,7 @@ def _topics_status(server: Ros2Server, as_json: bool) -> Callable[[], None]:
     metavar="X",
     help="Physical value that becomes 255.  [default: the maximum of the type]",
 )
-@click.option(
-    "--regions",
-    "region_files",
-    metavar="FILE",
-    multiple=True,
-    type=click.Path(path_type=Path, dir_okay=False, exists=True),
-    help="Make a port of each region of FILE; skin-import writes the regions of a robot's ports; repeatable.",
-)
+@cli.regions_option("Make a port of each region of FILE; skin-import writes those of a robot; may be repeated.")
 @click.option(
     "--server", metavar="HOST:PORT", help="YARP's name server.  [default: as yarp.conf says, else 127.0.0.1:10000]"
 )
@@ -246,7 +219,17 @@ def yarp(
         address = f"{known_by.host}:{known_by.port}"
         ready = {"event": "ready", "namespace": place.name, "server": address, "listen": host}
         say(as_json, ready, f"namespace {place.name!r} as ports {settings.prefix}/..., {known_by} (Ctrl-C ends)")
-        yarp_server.run(_ports_status(yarp_server) if as_json else lambda: None)
+        before: dict[str, int] = {}
+
+        def report() -> None:
+            ports = {}
+            for name, port in yarp_server.ports().items():
+                count = port.pop("messages")
+                ports[name] = {"rate_hz": count - before.get(name, 0), **port}
+                before[name] = count
+            print_json({"event": "status", "missed": yarp_server.missed, "ports": ports})
+
+        yarp_server.run(report if as_json else lambda: None)
 
 
 def _name_server(text: str | None) -> NameServer:
@@ -265,17 +248,3 @@ def _show_port(event: dict[str, Any]) -> None:
         cli.warn(f"{event['about']}: {event['why']}")
     else:
         echo(f"{event['port']}: driver {event['driver']}")
-
-
-def _ports_status(server: YarpServer) -> Callable[[], None]:
-    before: dict[str, int] = {}
-
-    def report() -> None:
-        ports = {}
-        for name, port in server.ports().items():
-            count = port.pop("messages")
-            ports[name] = {"rate_hz": count - before.get(name, 0), **port}
-            before[name] = count
-        print_json({"event": "status", "missed": server.missed, "ports": ports})
-
-    return report

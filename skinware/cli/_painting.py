@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeVar
 
@@ -48,12 +48,7 @@ class Palette:
 
 
 def palette_for(color_system: str | None, *, no_color: bool = False) -> Palette:
-    """Return the palette for a terminal.
-
-    Args:
-        color_system: of the terminal as rich detects it: ``truecolor``, ``256``, ``standard`` (16 colours), None.
-        no_color: the person wants no colours (``NO_COLOR`` is set).
-    """
+    """Return the palette for a terminal, of a colour system as rich detects it."""
     if no_color or color_system is None:
         return CHARACTERS
     return {"truecolor": TRUE_COLOURS, "256": COLOURS_256}.get(color_system, COLOURS_16)
@@ -69,15 +64,6 @@ def _spread(colours: Sequence[_T]) -> tuple[_T, ...]:
     return tuple(colours[-(-level * (len(colours) - 1) // (LEVELS - 1))] for level in range(LEVELS))
 
 
-def _between(anchors: Sequence[str]) -> Colours:
-    """Return one colour for each level, from the first anchor to the last."""
-    colours = [Color.parse(text).get_truecolor() for text in anchors]
-    steps = [level * (len(colours) - 1) / (LEVELS - 1) for level in range(LEVELS)]
-    return tuple(
-        mixed(colours[int(step)], colours[min(int(step) + 1, len(colours) - 1)], step - int(step)) for step in steps
-    )
-
-
 def _ansi(numbers: Sequence[int]) -> Colours:
     """Return colours of the table of 256, which stay the same when they are turned into numbers again."""
     return tuple(Color.from_ansi(number).get_truecolor() for number in numbers)
@@ -86,20 +72,28 @@ def _ansi(numbers: Sequence[int]) -> Colours:
 _GROUND = ColorTriplet(18, 18, 18)
 """Colour of the screen."""
 _BLACK, _WHITE = ColorTriplet(0, 0, 0), ColorTriplet(255, 255, 255)
-_VIRIDIS = _between(
-    (
+_VIRIDIS = tuple(
+    Color.parse(text).get_truecolor()
+    for text in (
         "#482475",
-        "#414487",
-        "#355f8d",
+        "#443780",
+        "#3f4988",
+        "#375a8c",
+        "#31698d",
         "#2a788e",
-        "#21918c",
-        "#22a884",
+        "#25878d",
+        "#21968a",
+        "#22a386",
+        "#30b17c",
         "#44bf70",
-        "#7ad151",
-        "#bddf26",
+        "#64ca5d",
+        "#87d448",
+        "#b0dc2f",
+        "#d7e226",
         "#fde725",
     )
 )
+"""One colour for each level."""
 _BASIC = {
     name: ColorTriplet(*rgb)
     for name, rgb in {
@@ -133,13 +127,7 @@ COLOURS_16 = Palette(
     no_value=_BASIC["red"],
     settling=_BASIC["grey"],
 )
-CHARACTERS = Palette(
-    ramp=TRUE_COLOURS.ramp,
-    stale=TRUE_COLOURS.stale,
-    no_value=TRUE_COLOURS.no_value,
-    settling=TRUE_COLOURS.settling,
-    characters="".join(_spread("▁▂▃▄▅▆▇█")),
-)
+CHARACTERS = replace(TRUE_COLOURS, characters="".join(_spread("▁▂▃▄▅▆▇█")))
 
 
 MARK_CHARACTERS = {
@@ -185,12 +173,7 @@ def changed_lines(before: npt.NDArray[np.uint8], now: npt.NDArray[np.uint8]) -> 
 def segments_of(
     upper: npt.NDArray[np.uint8], lower: npt.NDArray[np.uint8], labels: Sequence[Label], palette: Palette
 ) -> list[Segment]:
-    """Return one line of a map.
-
-    Args:
-        upper: (columns,) uint8, codes of the pixels in the upper half of the line.
-        lower: (columns,) uint8, codes of the pixels in the lower half.
-    """
+    """Return one line of a map from the codes of its pixels, (columns,) uint8 for each half of the line."""
     pairs = upper.astype(np.uint16) << 8 | lower
     segments: list[Segment] = []
     text, style = "", _PLAIN
@@ -224,9 +207,11 @@ def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
         return _character(lower if upper == BACKGROUND else upper, palette), Style.null()
     if upper != lower and BACKGROUND in (upper, lower):
         code = upper if lower == BACKGROUND else lower
-        return "▀" if code == upper else "▄", _GROUND_STYLE + Style(color=_colour(colour_of(code, palette)))
+        return "▀" if code == upper else "▄", _GROUND_STYLE + Style(color=Color.from_triplet(colour_of(code, palette)))
     if upper != lower:
-        return "▀", Style(color=_colour(colour_of(upper, palette)), bgcolor=_colour(colour_of(lower, palette)))
+        return "▀", Style(
+            color=Color.from_triplet(colour_of(upper, palette)), bgcolor=Color.from_triplet(colour_of(lower, palette))
+        )
     if upper == BACKGROUND:
         return " ", _GROUND_STYLE
     ground = colour_of(upper, palette)
@@ -234,7 +219,7 @@ def _cell(pair: int, palette: Palette) -> tuple[str, Style]:
     red, green, blue = ground
     readable = _BLACK if 0.3 * red + 0.59 * green + 0.11 * blue > 110 else _WHITE
     ink = palette.ramp[level] if mark == heat.STALE else readable
-    return _character(upper, palette), Style(color=_colour(ink), bgcolor=_colour(ground))
+    return _character(upper, palette), Style(color=Color.from_triplet(ink), bgcolor=Color.from_triplet(ground))
 
 
 def _character(code: int, palette: Palette) -> str:
@@ -244,16 +229,8 @@ def _character(code: int, palette: Palette) -> str:
     return palette.characters[level] if palette.characters and mark == heat.FRESH else MARK_CHARACTERS.get(mark, "?")
 
 
-def _colour(triplet: ColorTriplet) -> Color:
-    return Color.from_triplet(triplet)
-
-
 def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
-    """Return the colours from the lowest level to the highest, with their values.
-
-    Args:
-        values: of the lowest level, of the middle one if it is wanted, and of the highest.
-    """
+    """Return the colours from the lowest level to the highest, with values at both and perhaps in the middle."""
     first, *others = map(figure_text, values)
     text = Text(f"{first} ", no_wrap=True)
     half = LEVELS // len(others)
@@ -263,18 +240,13 @@ def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
                 text.append(palette.characters[level + 1])
             else:
                 left, right = palette.ramp[level : level + 2]
-                text.append("▌", Style(color=_colour(left), bgcolor=_colour(right)))
+                text.append("▌", Style(color=Color.from_triplet(left), bgcolor=Color.from_triplet(right)))
         text.append(f" {other}{' ' * (number + 1 < len(others))}")
     return text.append(f" {unit}".rstrip())
 
 
 def marks_text(marks: npt.NDArray[np.uint8], reasons: Mapping[str, int], palette: Palette) -> Text:
-    """Return how many sensors are fresh, the other marks that are seen, and the reasons of a calmed driver.
-
-    Args:
-        marks: (n,) uint8, marks of all sensors that are drawn.
-        reasons: how many of them have each; see :func:`skinware.state.count_reasons`.
-    """
+    """Return how many sensors are fresh, the other marks that are seen, and the reasons of a calmed driver."""
     counts = np.bincount(marks, minlength=len(MARK_CHARACTERS)).tolist()
     text = Text(f"{counts[heat.FRESH]} fresh", no_wrap=True, overflow="ellipsis")
     for mark, name in MARK_NAMES.items():
@@ -358,11 +330,7 @@ class HeatMap(TextLines):
         pixels: npt.NDArray[np.uint8],
         marks: Mapping[int, Sequence[Label]],
     ) -> None:
-        """Draw the lines that changed.
-
-        Args:
-            pixels: (2 * lines, columns) uint8 from ``arrangement.draw``; not changed afterwards.
-        """
+        """Draw the lines that changed; ``pixels`` of ``arrangement.draw`` are not changed afterwards."""
         before = self._pixels if arrangement is self._arrangement else None
         moved = {line for line in self._marks.keys() | marks.keys() if self._marks.get(line) != marks.get(line)}
         self._arrangement, self._pixels, self._marks = arrangement, pixels, marks

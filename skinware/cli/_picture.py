@@ -37,9 +37,6 @@ def change_levels(
     """Return the levels of changes, and the changes at the lowest, the middle and the highest level.
 
     Levels grow with the square root, so that the lightest touch differs from none, and a light one from a hard one.
-
-    Args:
-        change: (n,) physical, 0 or more.
     """
     felt = np.sqrt(np.maximum(change - np.float32(noise), 0))
     return levels_of(felt, 0.0, math.sqrt(max(span - noise, 1e-30)), before), (0.0, span / 4, span)
@@ -47,12 +44,6 @@ def change_levels(
 
 class Picture:
     """The sensors of one type in one row of the list, drawn into a given space.
-
-    Args:
-        type_name: the type to draw where there is one of this name; otherwise each driver's first; see ``types_of``.
-        scale_name: the first meaning of the colours, one of ``SCALES``.
-        regions: that a person may choose from; None: there are none.
-        region: draw only sensors in this one at first; None: all.
 
     Attributes:
         scale_name: the meaning of the colours: ``change`` from rest, the type's ``range``, ``raw`` counts.
@@ -109,14 +100,14 @@ class Picture:
         self._levels = None
 
     def draw(self, key: RowKey, frame: DriverSnapshot, width: int, height: int, life: str) -> None:
-        """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts.
-
-        Args:
-            life: what the driver is doing; nothing is fresh where no news comes.
-        """
+        """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts; ``life`` says whether news comes."""
         structure = frame.structure
         sensor_type, physical = self.type_in(structure), physical_values(frame)
-        memory = self._follow(key.driver, frame, physical)
+        memory = self._memories.get(key.driver)
+        if memory is None or memory.structure is not structure:
+            memory = self._memories[key.driver] = Memory(structure)
+            self._layouts[key.driver] = SkinLayout((key.driver,), (structure,))
+        memory.rest.follow(physical, frame.status == 0, frame.published_ns)
         made_for = (key, structure, sensor_type, self._region, width, height)
         if self.arrangement is None or made_for != self._made_for:
             self.arrangement = self._arrange(key, structure, sensor_type.name, width, height)
@@ -159,14 +150,6 @@ class Picture:
         if self._wanted not in (None, type_name):
             self.title += f" (there are no {self._wanted} sensors)"
         return arrangement
-
-    def _follow(self, driver: str, frame: DriverSnapshot, physical: npt.NDArray[np.float32]) -> Memory:
-        memory = self._memories.get(driver)
-        if memory is None or memory.structure is not frame.structure:
-            memory = self._memories[driver] = Memory(frame.structure)
-            self._layouts[driver] = SkinLayout((driver,), (frame.structure,))
-        memory.rest.follow(physical, frame.status == 0, frame.published_ns)
-        return memory
 
     def _scaled(
         self,

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from skinware import bridge_state
-from skinware.cli._terminal import echo, print_json, style, terminal_width
+from skinware.cli._terminal import say, style, terminal_width
 from skinware.driver_service import KIND, DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
@@ -24,7 +24,7 @@ from skinware.service import ServiceReader
 from skinware.state import DriverReport, life_of, rate_now_hz, report_of
 from skinware.status import DataPath, load_report
 from skinware.structure import Structure
-from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_report import HealthKind, HealthReport
 from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
 from skinware.text import age_text_ms, count_text, plural, table, words, wrapped
@@ -33,17 +33,11 @@ SampleT = TypeVar("SampleT", bound=Sample)
 
 
 def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
-    """Return everything that can be seen of a namespace, as ``skin-info --json`` prints it.
-
-    Raises:
-        ServiceNotFound: no service has the name ``only``.
-        NamespaceError: the namespace cannot be trusted or read.
-        ConfigurationError: ``only`` cannot be a name.
-    """
+    """Return everything that can be seen of a namespace, as ``skin-info --json`` prints it."""
     drivers: list[dict[str, Any]] = []
     services: list[dict[str, Any]] = []
     problems: list[str] = []
-    readers = [_reader(record) for record in living_readers(namespace)]
+    readers = [msgspec.structs.asdict(record) | _times(record) for record in living_readers(namespace)]
     if len(list(namespace.reader_files(MOST_ANNOUNCEMENTS + 1))) > MOST_ANNOUNCEMENTS:
         folder = namespace.readers_path
         problems.append(f"{folder}: more than {MOST_ANNOUNCEMENTS} files; readers may be missing here; empty it")
@@ -65,13 +59,7 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
 
 
 def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
-    """Return every sensor of a driver in the order of its snapshots.
-
-    Raises:
-        ServiceNotFound: there is no such driver.
-        BadServiceFile: this is not a driver, or cannot be read safely.
-        NamespaceError: the namespace cannot be trusted or read.
-    """
+    """Return every sensor of a driver in the order of its snapshots."""
     with DriverReader(driver, namespace=namespace, announce=False) as reader:
         structure = reader.structure
     names = {sensor_type.id: sensor_type.name for sensor_type in structure.types}
@@ -92,21 +80,29 @@ def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
 
 def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
     with ServiceReader[Sample](name, namespace=namespace, announce=False) as service:
-        if service.kind != KIND:
-            entry = _common(service, _newest(service))
-            entry |= {"description": service.schema.description, "columns": _columns(service)}
-            return entry | ({"bridge": _bridge(namespace, name)} if service.kind == bridge_state.KIND else {})
-    with DriverReader(name, namespace=namespace, announce=False) as driver:
-        frame = _newest(driver)
-        common = _common(driver, frame)
-        return {**common, **_skin(driver, frame, common["state"])}
-
-
-def _bridge(namespace: Namespace, name: str) -> dict[str, Any] | None:
-    """Return the state that a bridge publishes; None before its first sample."""
-    with bridge_state.BridgeReader(name, namespace=namespace, announce=False) as reader:
-        frame = _newest(reader)
-        return None if frame is None else {"robot": frame.state.robot, **bridge_state.as_data(frame.state)}
+        if service.kind == KIND:
+            with DriverReader(name, namespace=namespace, announce=False) as driver:
+                frame = _newest(driver)
+                common = _common(driver, frame)
+                return {**common, **_skin(driver, frame, common["state"])}
+        entry = _common(service, _newest(service))
+        entry["description"] = service.schema.description
+        entry["columns"] = [
+            {
+                "name": column_name,
+                "dtype": np.lib.format.dtype_to_descr(column.dtype),
+                "shape": column.shape,
+                "unit": column.unit,
+                "description": column.description,
+            }
+            for column_name, column in service.schema.columns.items()
+        ]
+        if service.kind == bridge_state.KIND:
+            with bridge_state.BridgeReader(name, namespace=namespace, announce=False) as bridge:
+                newest = _newest(bridge)  # None before its first sample
+                state = None if newest is None else {"robot": newest.state.robot, **bridge_state.as_data(newest.state)}
+            entry["bridge"] = state
+        return entry
 
 
 def _newest(service: ServiceReader[SampleT]) -> SampleT | None:
@@ -139,10 +135,6 @@ def _common(service: ServiceReader[Any], frame: Sample | None) -> dict[str, Any]
     }
 
 
-def _reader(record: ReaderRecord) -> dict[str, Any]:
-    return msgspec.structs.asdict(record) | _times(record)
-
-
 def _times(of: WriterStatistics | ReaderRecord) -> dict[str, Any]:
     """Return times: extremes and means, and histograms with two bounds from them."""
     spreads = {
@@ -154,19 +146,6 @@ def _times(of: WriterStatistics | ReaderRecord) -> dict[str, Any]:
 
 def _histogram(h: Histogram) -> dict[str, Any]:
     return {"p50_ns": h.quantile_ns(0.5), "p99_ns": h.quantile_ns(0.99), "counts": h.counts}
-
-
-def _columns(service: ServiceReader[Any]) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": name,
-            "dtype": np.lib.format.dtype_to_descr(column.dtype),
-            "shape": column.shape,
-            "unit": column.unit,
-            "description": column.description,
-        }
-        for name, column in service.schema.columns.items()
-    ]
 
 
 def _skin(driver: DriverReader, frame: DriverSnapshot | None, life: str) -> dict[str, Any]:
@@ -242,26 +221,7 @@ _FAULT_COLOUR = "yellow"
 
 
 def show(namespaces: Sequence[Namespace], driver: str | None, as_json: bool) -> None:
-    """Print the health of sensors: see :func:`health`.
-
-    Raises:
-        ServiceNotFound: no service publishes the health of that driver.
-    """
-    found = health(namespaces, driver)
-    if driver is not None and not (found["health"] or found["problems"]):
-        raise ServiceNotFound(f"no service publishes the health of driver {driver!r}; start one: skin-calm {driver}")
-    if as_json:
-        print_json(found)
-    else:
-        echo("\n".join(part for line in as_text(found) for part in wrapped(line, terminal_width())))
-
-
-def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any]:
-    """Return the health of all sensors that services publish, as ``skin-info --health --json`` prints it.
-
-    Raises:
-        NamespaceError: a namespace cannot be trusted or read.
-    """
+    """Print the health of all sensors that services publish, or of those of one driver."""
     entries: list[dict[str, Any]] = []
     problems: list[str] = []
     for namespace in namespaces:
@@ -274,7 +234,10 @@ def health(namespaces: Sequence[Namespace], driver: str | None) -> dict[str, Any
                 problems.append(str(error))
                 continue
             entries += [entry] if entry is not None else []
-    return {"health": entries, "problems": problems}
+    found = {"health": entries, "problems": problems}
+    if driver is not None and not (found["health"] or found["problems"]):
+        raise ServiceNotFound(f"no service publishes the health of driver {driver!r}; start one: skin-calm {driver}")
+    say(as_json, found, "\n".join(part for line in as_text(found) for part in wrapped(line, terminal_width())))
 
 
 def as_text(found: dict[str, Any]) -> list[str]:

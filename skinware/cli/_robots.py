@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -19,14 +20,15 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.text import NO_VALUE, age_text_ms, count_text, plural, rate_text, state_shown, table
 
 if TYPE_CHECKING:
-    from skinware.bridge import Watcher
     from skinware.bridge.watching import Seen
 
 _PORT = 7447
-_PRESENCE = {0: "gone", 1: "there"}
 _PATIENCE_S = 3
 """How long to wait for the summaries of robots; a robot without one for this long is silent."""
 _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "dropped", "silent patches", "problems", "clock")
+connect_option = click.option(
+    "--connect", multiple=True, required=True, metavar="ENDPOINT", help="Robot or router: tcp/HOST:PORT."
+)
 
 
 @click.command(
@@ -46,7 +48,7 @@ _TITLES = ("robot", "driver", "state", "rate", "age", "fresh sensors", "dropped"
 @click.option(
     "--connect", multiple=True, metavar="ENDPOINT", help="Another router, whose robots are reached here, too."
 )
-@cli.tls_option
+@cli.tls_option()
 @cli.caller_option
 @click.option(
     "--robot",
@@ -92,24 +94,19 @@ def route(
         with cli.signals_end(watcher.stop):
             ready = {"event": "ready", "listen": list(places.listen), "connect": list(places.connect)}
             say(as_json, ready, f"router: {places} (Ctrl-C ends)")
-            watcher.run(_Routed(watcher, as_json).tell)
+            shown: dict[str, str] = {}
 
+            def report() -> None:
+                count = Counter(seen.robot for seen in watcher.robots())
+                if as_json:
+                    print_json({"event": "status", "robots": dict(count)})
+                    return
+                states = dict.fromkeys(shown, "gone")
+                for robot, n in count.items():
+                    states[robot] = "there" if n == 1 else f"{n} robots have this name"
+                cli.echo_changes(shown, dict(sorted(states.items())))
 
-class _Routed:
-    """Prints which robots come and go."""
-
-    def __init__(self, watcher: Watcher, as_json: bool) -> None:
-        self._watcher, self._as_json = watcher, as_json
-        self._known: dict[str, int] = {}
-
-    def tell(self) -> None:
-        count = Counter(seen.robot for seen in self._watcher.robots())
-        if self._as_json:
-            print_json({"event": "status", "robots": dict(count)})
-        for robot in sorted({*count, *self._known} if not self._as_json else ()):
-            if count[robot] != self._known.get(robot, 0):
-                echo(f"robot {robot}: {_PRESENCE.get(count[robot]) or f'{count[robot]} robots have this name'}")
-        self._known = dict(count)
+            watcher.run(report)
 
 
 @click.command(
@@ -119,8 +116,8 @@ class _Routed:
         "skin-bridge list --connect tls/router.lab:7447 --tls certs --watch   all robots, every second",
     ),
 )
-@click.option("--connect", multiple=True, required=True, metavar="ENDPOINT", help="Robot or router: tcp/HOST:PORT.")
-@cli.tls_option
+@connect_option
+@cli.tls_option()
 @click.option("--watch", is_flag=True, help="Update every second.")
 @cli.json_option
 def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json: bool) -> None:
@@ -131,53 +128,36 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
     Exit status: 0 done or interrupted, 1 no robot reached, 2 wrong usage.
     """
     from skinware.bridge import Link, Watcher, endpoints
+    from skinware.bridge.endpoints import why_unreachable
 
     places = endpoints(connect=connect, tls=tls)
     with contextlib.closing(Link(places)) as link:
-        watcher = Watcher(link)
-        listed = _Listed(watcher, places.connect, tls, as_json=as_json, watch=watch)
+        watcher, seconds = Watcher(link), itertools.count(1)
+
+        def report() -> None:
+            second, robots = next(seconds), watcher.robots()
+            if not watch:
+                if second < _PATIENCE_S and not (robots and all(seen.summary for seen in robots)):
+                    return
+                watcher.stop()
+            found = _report(robots)
+            if not robots and second % _PATIENCE_S == 0:
+                why = " ".join(filter(None, (why_unreachable(at, tls) for at in places.connect)))
+                why = why or "something listens there, but no robot answers; does it want --tls?"
+                if not watch:
+                    raise BridgeError(why)
+                found["problems"].append(why)
+            if as_json:
+                print_json(found)
+            elif watch and sys.stdout.isatty():
+                redraw(_as_text(found))
+            else:
+                echo("\n".join(_as_text(found)))
+
         if watch and as_json:
             print_json({"event": "ready", "connect": list(places.connect)})
         with cli.signals_end(watcher.stop):
-            watcher.run(listed.tell)
-    if listed.why:
-        raise BridgeError(listed.why)
-
-
-class _Listed:
-    """Prints the state of all robots, each second or once."""
-
-    def __init__(
-        self, watcher: Watcher, places: Sequence[str], tls: Path | None, *, as_json: bool, watch: bool
-    ) -> None:
-        self._watcher, self._places, self._tls = watcher, places, tls
-        self._as_json, self._watch = as_json, watch
-        self._seconds = 0
-        self.why = ""
-
-    def tell(self) -> None:
-        from skinware.bridge.endpoints import why_unreachable
-
-        self._seconds += 1
-        robots = self._watcher.robots()
-        is_late = self._seconds >= _PATIENCE_S
-        if not self._watch:
-            if not is_late and not (robots and all(seen.summary for seen in robots)):
-                return
-            self._watcher.stop()
-        found = _report(robots)
-        if not robots and is_late and self._seconds % _PATIENCE_S == 0:
-            why = " ".join(filter(None, (why_unreachable(at, self._tls) for at in self._places)))
-            found["problems"].append(why or "something listens there, but no robot answers; does it want --tls?")
-            if not self._watch:
-                self.why = found["problems"][-1]
-                return
-        if self._as_json:
-            print_json(found)
-        elif self._watch and sys.stdout.isatty():
-            redraw(_as_text(found))
-        else:
-            echo("\n".join(_as_text(found)))
+            watcher.run(report)
 
 
 def _report(robots: Sequence[Seen]) -> dict[str, Any]:
@@ -188,7 +168,27 @@ def _report(robots: Sequence[Seen]) -> dict[str, Any]:
         for seen in robots
         if seen.guard.count
     ]
-    return {"event": "status", "robots": [_report_of(seen) for seen in robots], "problems": problems}
+    entries = []
+    for seen in robots:
+        told_s = (now_ns() - seen.heard_ns) / NS_PER_S if seen.heard_ns else None
+        clock = {
+            "offset_ms": seen.clock.offset_ns(now_ns()) / 1e6,
+            "error_ms": seen.clock.error_ns / 1e6,
+            "round_trip_ms": seen.clock.round_trip_ns / 1e6,
+        }
+        entry = {
+            "robot": seen.robot,
+            "instance": seen.instance,
+            "version": seen.version,
+            "state": "starting" if told_s is None else "live" if told_s < _PATIENCE_S else "silent",
+            "told_s": told_s,
+            "bytes": seen.bytes,
+            "refused": seen.guard.count,
+            "last_refused": seen.guard.last or None,
+            "clock": clock if seen.clock.is_known else None,
+        }
+        entries.append(entry | ({} if seen.summary is None else msgspec.to_builtins(seen.summary)))
+    return {"event": "status", "robots": entries, "problems": problems}
 
 
 def _as_text(found: dict[str, Any]) -> list[str]:
@@ -200,29 +200,6 @@ def _as_text(found: dict[str, Any]) -> list[str]:
     return [*lines, *(style("problem: ", fg="red") + text for text in found["problems"])]
 
 
-def _report_of(seen: Seen) -> dict[str, Any]:
-    told_s = (now_ns() - seen.heard_ns) / NS_PER_S if seen.heard_ns else None
-    summary, clock = seen.summary, seen.clock
-    return {
-        "robot": seen.robot,
-        "instance": seen.instance,
-        "version": seen.version,
-        "state": "starting" if told_s is None else "live" if told_s < _PATIENCE_S else "silent",
-        "told_s": told_s,
-        "bytes": seen.bytes,
-        "refused": seen.guard.count,
-        "last_refused": seen.guard.last or None,
-        "clock": {
-            "offset_ms": clock.offset_ns(now_ns()) / 1e6,
-            "error_ms": clock.error_ns / 1e6,
-            "round_trip_ms": clock.round_trip_ns / 1e6,
-        }
-        if clock.is_known
-        else None,
-        **({} if summary is None else msgspec.to_builtins(summary)),
-    }
-
-
 def _rows_of(robot: dict[str, Any], has_namesakes: bool) -> list[tuple[str, ...]]:
     called = (
         f"{robot['robot']} ({robot.get('host') or '?'}, {robot['instance'][:8]})" if has_namesakes else robot["robot"]
@@ -232,23 +209,19 @@ def _rows_of(robot: dict[str, Any], has_namesakes: bool) -> list[tuple[str, ...]
     nothing = (NO_VALUE,) * 6
     if not robot.get("drivers"):
         return [(called, NO_VALUE, robot["state"], *nothing, error)]
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, driver in robot["drivers"].items():
         state = f"was {driver['state']}"
         if robot["state"] == "live":
             state = state_shown(driver["state"], driver["fresh"], driver["sensors"])
-        rows.append((called, name, state, *_figures_of(driver), error))
+        silent, more = ", ".join(driver["silent"]), driver["n_silent"] - len(driver["silent"])
+        figures = (
+            rate_text(driver["rate_hz"]),
+            age_text_ms(driver["age_ms"]),
+            f"{count_text(driver['fresh'])} of {count_text(driver['sensors'])}",
+            count_text(driver["dropped"]),
+            f"{silent} and {more} more" if more else silent or NO_VALUE,
+            count_text(driver["problems"]),
+        )
+        rows.append((called, name, state, *figures, error))
     return rows
-
-
-def _figures_of(driver: dict[str, Any]) -> tuple[str, ...]:
-    names = ", ".join(driver["silent"])
-    more = driver["n_silent"] - len(driver["silent"])
-    return (
-        rate_text(driver["rate_hz"]),
-        age_text_ms(driver["age_ms"]),
-        f"{count_text(driver['fresh'])} of {count_text(driver['sensors'])}",
-        count_text(driver["dropped"]),
-        f"{names} and {more} more" if more else names or NO_VALUE,
-        count_text(driver["problems"]),
-    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import json
 import logging
 import os
 import re
@@ -32,11 +33,7 @@ _AT_THE_END_S = 1.0
 
 
 class PatientStream(io.TextIOBase):
-    """Accept text at once, and write it when the reader takes it.
-
-    Attributes:
-        left_out: writes that were left out because too much text waited.
-    """
+    """Accept text at once, and write it when the reader takes it; too much text is left out, and counted."""
 
     def __init__(self, stream: TextIO) -> None:
         self._own_fd: int | None = None  # first: Python also closes a stream that could not be made
@@ -66,11 +63,7 @@ class PatientStream(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        """Accept text, and write as much as possible now.
-
-        Raises:
-            BrokenPipeError: the reader is gone.
-        """
+        """Accept text, and write as much as possible now; BrokenPipeError if the reader is gone."""
         data = text.encode(self.encoding, self.errors or "strict")
         with self._lock:
             if self._size + len(data) > _MOST_WAITING:
@@ -82,11 +75,7 @@ class PatientStream(io.TextIOBase):
         return len(text)
 
     def flush(self) -> None:
-        """Write as much as possible now.
-
-        Raises:
-            BrokenPipeError: the reader is gone.
-        """
+        """Write as much as possible now; BrokenPipeError if the reader is gone."""
         with self._lock:
             while self._waiting:
                 data = self._waiting[0]
@@ -207,10 +196,14 @@ def overwrite(text: str, *, err: bool = False) -> None:
     click.echo(f"\r{shown(text)}\x1b[K", nl=False, err=err, color=True)
 
 
+def are_terminals(*streams: TextIO | None) -> bool:
+    """Return whether all these streams are open and on a terminal."""
+    return all(stream is not None and stream.isatty() for stream in streams)
+
+
 def terminal_width() -> int | None:
     """Return the columns of the terminal on stdout; None without a terminal, where lines may have any length."""
-    is_terminal = sys.stdout is not None and sys.stdout.isatty()
-    return shutil.get_terminal_size().columns if is_terminal else None
+    return shutil.get_terminal_size().columns if are_terminals(sys.stdout) else None
 
 
 def redraw(lines: list[str]) -> None:
@@ -240,14 +233,9 @@ def say(as_json: bool, data: object, text: str) -> None:
 def json_text(data: object) -> str:
     """Return an object as JSON, in which characters that cannot be printed are escaped."""
     text = msgspec.json.encode(data).decode()
-    return text if text.isprintable() else "".join(map(_escaped, text))
-
-
-def _escaped(sign: str) -> str:
-    if sign.isprintable():
-        return sign
-    units = sign.encode("utf-16-be", "surrogatepass")
-    return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() else json.dumps(sign)[1:-1] for sign in text)
 
 
 class Formatter(logging.Formatter):

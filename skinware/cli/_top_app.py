@@ -1,4 +1,4 @@
-"""The live view of ``skin-top`` with Textual: a list of drivers, buses and patches, and a picture of one of them."""
+"""The live view of ``skin-top`` with Textual: drivers, buses and patches, a picture of one, and its help."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from typing import ClassVar
 from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Container, Horizontal, Vertical
-from textual.screen import Screen
+from textual.containers import Container, Horizontal, Vertical, VerticalScroll
+from textual.screen import ModalScreen, Screen
 from textual.widgets import Footer, Static
 
 from skinware.bridge_state import as_data, summary
-from skinware.cli._painting import HeatMap, Palette, palette_for
+from skinware.cli._painting import MARK_CHARACTERS, MARK_NAMES, HeatMap, Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
-from skinware.cli._top_help import Help
 from skinware.cli._top_list import DriverList
-from skinware.cli._top_rows import ListRow, labels_of, lines_of, rows_of
+from skinware.cli._top_rows import COLUMNS, ListRow, labels_of, lines_of, rows_of
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.state import LIVE, life_of
@@ -51,6 +50,63 @@ Start one in another terminal, for example:
 It appears here when it runs.  q quits."""
 
 
+_MEANINGS = (
+    "a driver, its buses, and the patches on each",
+    "live, or what is wrong; a driver that hangs is silent",
+    "snapshots a second of a driver, updates of a patch",
+    "time since the newest value was measured",
+    "sensors with a good and new value, of all",
+    "frames thrown away before the driver read them",
+    "frames of no update that the driver could complete",
+    "other counts of the row; all are below the picture",
+)
+"""The meaning of each column of the list."""
+
+REASONS = {
+    "held": "touched; the baseline is predicted, not measured",
+    "relearning": "the baseline is not known yet, or less well than the noise",
+    "covered": "below its baseline: covered, or touched when that was measured",
+    "doubted": "falls and returns untouched: its polarity may be wrong",
+    "saturated": "at the end of its range: it may bear more than it shows",
+    "no resolution": "too few levels to show how strong a touch is",
+}
+"""The meaning of each reason of a calmed driver, as :func:`skinware.text.why_text` writes them."""
+
+KEYS = {
+    "up, down": "choose a row; the picture shows its sensors",
+    "o": "order: the worst states first, or as drivers name their parts",
+    "t": "next sensor type",
+    "s": "colours: change since the baseline, range, raw counts",
+    "b": "take the present values as the baseline of the picture",
+    "r": "next region, if regions were given",
+    "PgUp, PgDn": "scroll the picture",
+    "mouse": "point at a sensor: name, value and status",
+    "q": "quit",
+}
+
+
+class Help(ModalScreen[None]):
+    """The explanations; any of its keys closes them."""
+
+    CSS = """
+    Help { align: center middle; }
+    Help > VerticalScroll {
+        width: 82; max-width: 100%; height: auto; max-height: 100%; border: round #27548a; padding: 0 1;
+    }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,question_mark,q", "dismiss", "Close")]
+
+    def compose(self) -> ComposeResult:
+        marks = {MARK_CHARACTERS[mark]: name for mark, name in MARK_NAMES.items()}
+        columns = dict(zip(COLUMNS, _MEANINGS, strict=True))
+        parts = {"Columns": columns, "Marks over sensors": marks, "Reasons, beside skin-calm": REASONS, "Keys": KEYS}
+        lines = []
+        for title, meanings in parts.items():
+            lines += ["", title, *(f"  {name:<18} {meaning}" for name, meaning in meanings.items())]
+        with VerticalScroll():
+            yield Static("\n".join(lines[1:]), markup=False)
+
+
 class _Blank(Vertical):
     BLANK = True  # nothing of its own is drawn
 
@@ -60,16 +116,7 @@ class _BlankScreen(Screen[None]):
 
 
 class SkinTop(App[None]):
-    """Show drivers, buses and patches, and a picture of the sensors under the cursor.
-
-    Args:
-        type_name: type of sensors to draw first; default: each driver's first.
-        duration_s: end after this time; None: only by a key or signal.
-        scale_name: the first meaning of the colours: ``change``, ``range`` or ``raw``.
-        palette: default: the best that the terminal can show.
-        regions: that a person may choose from; None: there are none.
-        region: draw only sensors in this one at first; None: all.
-    """
+    """Show drivers, buses and patches, and a picture of the sensors under the cursor."""
 
     TITLE = "skin-top"
     ENABLE_COMMAND_PALETTE = False

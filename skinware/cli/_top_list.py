@@ -40,12 +40,7 @@ def room_for(width: int) -> dict[int, int]:
 
 
 class DriverList(TextLines):
-    """Rows under their titles. The row that a person chose stays chosen, wherever it is, and when it comes back.
-
-    Attributes:
-        rows: all of them.
-        cursor: number of the chosen row.
-    """
+    """Rows under their titles. The row that a person chose stays chosen, wherever it is, and when it comes back."""
 
     class RowChosen(Message):
         """Another row is chosen."""

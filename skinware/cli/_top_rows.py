@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,11 +57,7 @@ class ListRow(NamedTuple):
 
 
 def rows_of(report: DriverReport, *, worst_first: bool = True) -> list[ListRow]:
-    """Return the row of a driver, then those of its buses, each followed by its patches.
-
-    Args:
-        worst_first: put buses and patches with the worst states first; otherwise all are in the driver's order.
-    """
+    """Return the row of a driver, then those of its buses, each followed by its patches, in order or worst first."""
     name, counters = report.name, report.counters
     cells = (
         name,
@@ -98,14 +95,10 @@ def rows_of(report: DriverReport, *, worst_first: bool = True) -> list[ListRow]:
             patches.append(ListRow(RowKey(name, PATCH, number), patch_cells, badness(state), is_fresh, patch.counters))
         are_fresh = all(patch.is_fresh for patch in patches)
         row = ListRow(RowKey(name, BUS, at), cells, badness(report.state_of(bus)), are_fresh, bus.counters)
-        branches.append([row, *(sorted(patches, key=_bad) if worst_first else patches)])
+        branches.append([row, *(sorted(patches, key=attrgetter("bad"), reverse=True) if worst_first else patches)])
     if worst_first:
-        branches.sort(key=lambda rows: min(map(_bad, rows)))
+        branches.sort(key=lambda rows: max(row.bad for row in rows), reverse=True)
     return [driver, *(row for rows in branches for row in rows)]
-
-
-def _bad(row: ListRow) -> int:
-    return -row.bad
 
 
 def patches_of(key: RowKey, structure: Structure) -> list[int]:
@@ -119,12 +112,7 @@ def patches_of(key: RowKey, structure: Structure) -> list[int]:
 
 
 def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: str, sensors: int) -> str:
-    """Return the title of a picture.
-
-    Args:
-        structure: of its driver now, which may have changed since the list was made.
-        patches: that :func:`patches_of` returned.
-    """
+    """Return the title of a picture; the structure may have changed since the list was made."""
     if not patches:
         return "no patches here"
     drawn = plural(sensors, f"{type_name} sensor")
@@ -229,11 +217,7 @@ def contact_data(place: TouchedPlace) -> dict[str, Any]:
 
 
 def labels_of(places: Sequence[TouchedPlace], arrangement: Arrangement) -> dict[int, list[Label]]:
-    """Return the identities of contacts as labels of a picture, by line, each over its nearest sensor.
-
-    Args:
-        places: the contacts; contacts outside the picture have no label.
-    """
+    """Return the identities of contacts in a picture as labels, by line, each over its nearest sensor."""
     labels: dict[int, list[Label]] = {}
     for place in places:
         (number,) = np.flatnonzero(arrangement.sensors == place.sensor)[:1].tolist() or (None,)

@@ -35,7 +35,7 @@ _rate_option = click.option(
         "skin-bridge rerun arm -o arm.rrd  into a file",
     ),
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @click.option("--connect", metavar="URL", default=_RERUN, show_default=True, help="Viewer or server.")
 @cli.output_option("Write this file instead.", name="file")
 @_rate_option
@@ -68,7 +68,7 @@ def rerun(
     "foxglove",
     epilog=cli.examples("skin-bridge foxglove   then, in Foxglove: open a connection to ws://127.0.0.1:8765"),
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @click.option(
     "--host", default="127.0.0.1", show_default=True, help="Address to listen at; anybody who reaches it sees the skin."
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +11,11 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._middlewares import ros2, yarp
-from skinware.cli._robots import list_robots, route
+from skinware.cli._robots import connect_option, list_robots, route
 from skinware.cli._terminal import echo, print_json, say
 from skinware.cli._viewers import foxglove, rerun
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from skinware.bridge import Server
     from skinware.bridge_state import BridgeState
 
 _PORT = 7448
@@ -27,8 +25,7 @@ _MODES = {
 }
 
 
-@click.group("skin-bridge", context_settings=cli.CONTEXT_SETTINGS)
-@cli.version_option
+@cli.group("skin-bridge")
 def command() -> None:
     """Publish the drivers and services of one machine on another, in a ROS 2 graph, or as ports of YARP.
 
@@ -50,7 +47,7 @@ for _each in (route, list_robots, ros2, yarp, rerun, foxglove):
         "skin-bridge serve --robot icub --listen tls/0.0.0.0:7448 --tls certs  for all with a certificate",
     ),
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @click.option("--robot", required=True, metavar="R", help="Name of this robot.")
 @click.option(
     "--listen",
@@ -59,7 +56,7 @@ for _each in (route, list_robots, ros2, yarp, rerun, foxglove):
     help=f"Where peers connect: tcp/HOST:PORT.  [default: tcp/127.0.0.1:{_PORT}]",
 )
 @click.option("--connect", multiple=True, metavar="ENDPOINT", help="Connect to a router instead.")
-@cli.tls_option
+@cli.tls_option()
 @cli.caller_option
 @cli.insecure_option
 @cli.namespace_option
@@ -102,29 +99,23 @@ def serve(
             ready = {"event": "ready", "robot": robot, "namespace": place.name}
             where = {"listen": list(places.listen), "connect": list(places.connect)}
             say(as_json, ready | where, f"robot {robot}: namespace {place.name!r}, {places} (Ctrl-C ends)")
-            server.run(_serving_status(server, as_json))
+            before: dict[str, int] = {}
+            shown: dict[str, str] = {}
 
+            def report() -> None:
+                frames = server.frames()
+                if not as_json:
+                    cli.echo_changes(shown, {name: state for name, (state, _, _) in frames.items()})
+                    return
+                services = {}
+                for name, (state, count, pullers) in frames.items():
+                    services[name] = {"state": state, "rate_hz": count - before.get(name, 0), "pulled_by": pullers}
+                    before[name] = count
+                guard = server.guard
+                counts = {"missed": server.missed, "refused": guard.count, "last_refused": guard.last or None}
+                print_json({"event": "status", **counts, "services": services})
 
-def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
-    before: dict[str, int] = {}
-    shown: dict[str, str] = {}
-
-    def report() -> None:
-        frames = server.frames()
-        if as_json:
-            services = {
-                name: {"state": state, "rate_hz": count - before.get(name, 0), "pulled_by": pullers}
-                for name, (state, count, pullers) in frames.items()
-            }
-            guard = server.guard
-            counts = {"missed": server.missed, "refused": guard.count, "last_refused": guard.last or None}
-            print_json({"event": "status", **counts, "services": services})
-        else:
-            cli.echo_changes(shown, {name: state for name, (state, _, _) in frames.items()})
-        for name, (_, count, _) in frames.items():
-            before[name] = count
-
-    return report
+            server.run(report)
 
 
 @command.command(
@@ -136,15 +127,9 @@ def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
     ),
 )
 @click.argument("robot", metavar="R")
-@click.option(
-    "--connect",
-    multiple=True,
-    required=True,
-    metavar="ENDPOINT",
-    help="Robot or router: tcp/HOST:PORT.",
-)
+@connect_option
 @click.option("--into", metavar="NAMESPACE", help="Namespace in which its services appear.  [default: R]")
-@cli.tls_option
+@cli.tls_option()
 @click.option(
     "--mode",
     type=click.Choice(["auto", "push", "pull"]),
@@ -152,9 +137,7 @@ def _serving_status(server: Server, as_json: bool) -> Callable[[], None]:
     show_default=True,
     help="Get every frame (push), or only the newest, as fast as the link takes them (pull).",
 )
-@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; repeatable.")
-@click.option("--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; repeatable.")
-@cli.regions_option
+@cli.parts_options
 @cli.json_option
 def join(
     robot: str,
@@ -177,6 +160,7 @@ def join(
     from skinware.bridge import Joiner, Link, Wish, endpoints
     from skinware.bridge.endpoints import why_unreachable
     from skinware.bridge.messages import Keys
+    from skinware.bridge_state import as_data
     from skinware.memory.namespace import Namespace
 
     regions = tuple(cli.regions_asked_for(in_regions, region_files))
@@ -197,7 +181,15 @@ def join(
         with contextlib.closing(joiner), cli.signals_end(joiner.stop):
             ready = {"event": "ready", "robot": robot, "namespace": place.name, "connect": list(places.connect)}
             say(as_json, ready, f"robot {robot} appears in namespace {place.name!r}, {places} (Ctrl-C ends)")
-            joiner.run(_joined_status(as_json))
+            shown: dict[str, str] = {}
+
+            def report(bridge: BridgeState) -> None:
+                if as_json:
+                    print_json({"event": "status"} | as_data(bridge))
+                else:
+                    cli.echo_changes(shown, {name: service.state for name, service in bridge.services.items()})
+
+            joiner.run(report)
 
 
 def _show_event(event: dict[str, Any]) -> None:
@@ -209,19 +201,4 @@ def _show_event(event: dict[str, Any]) -> None:
         echo(f"robot {event['robot']}: {event['event']}{': ' + event['why'] if 'why' in event else ''}")
 
 
-def _joined_status(as_json: bool) -> Callable[[BridgeState], None]:
-    from skinware.bridge_state import as_data
-
-    shown: dict[str, str] = {}
-
-    def report(bridge: BridgeState) -> None:
-        if as_json:
-            print_json({"event": "status"} | as_data(bridge))
-            return
-        cli.echo_changes(shown, {name: service.state for name, service in bridge.services.items()})
-
-    return report
-
-
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)

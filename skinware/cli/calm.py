@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,20 +49,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="Name of the service of its contacts; NAME-contacts if that is taken; empty: none.",
 )
-@click.option(
-    "--regions",
-    "region_files",
-    multiple=True,
-    metavar="FILE",
-    type=cli.FILE,
-    help="File with regions whose motion is published; may be repeated.",
-)
-@click.option(
-    "--links",
-    metavar="FILE",
-    type=cli.FILE,
-    help="Links of the robot, as for skin-view: contacts hang together across the borders of links.",
-)
+@cli.regions_option("File with regions whose motion is published; may be repeated.")
+@cli.links_option("Links of the robot, as for skin-view: contacts hang together across the borders of links.")
 @click.option("--motion", metavar="NAME", default="motion", show_default=True, help="Name of the service of motion.")
 @click.option(
     "--health",
@@ -102,7 +91,6 @@ def command(
     from skinware.tactile.calm_service import CalmService
     from skinware.tactile.chain import ChainSettings
     from skinware.tactile.chain_state import default_path
-    from skinware.tactile.derived_services import WatchedRegions
     from skinware.tactile.regions import read_regions
     from skinware.text import nearest_name
     from skinware.views.robot import read_robot
@@ -122,16 +110,23 @@ def command(
         group=group,
         state_path=state_path or default_path(target.name, name),
         contacts=contacts or None,
-        watched=WatchedRegions(read_regions(*region_files), motion) if region_files else None,
+        regions=read_regions(*region_files) if region_files else None,
+        motion=motion,
         poses=read_robot(links).poses if links else None,
         health=health or None,
     )
     services = source.services()
     if name not in services:
         cli.warn(f"waiting for driver {name!r} in {source.name!r}{nearest_name(name, services)}")
+
+    def report() -> None:
+        try:
+            print_json({"event": "status", "name": service.name, **service.status()})
+        except BrokenPipeError:
+            service.stop()
+
     with cli.signals_end(service.stop):
-        report = (lambda: _report_status(service)) if as_json else lambda: None
-        service.run(report, on_ready=lambda: _report_ready(service, as_json))
+        service.run(report if as_json else lambda: None, on_ready=lambda: _report_ready(service, as_json))
     if as_json:
         with contextlib.suppress(BrokenPipeError):
             print_json({"event": "stopped", "name": service.name, **service.status()})
@@ -143,7 +138,12 @@ def _report_ready(service: CalmService, as_json: bool) -> None:
         return
     structure = chain.structure
     units = {sensor_type.name: sensor_type.unit for sensor_type in structure.types}
-    beside = _services_beside(service)
+    contacts, health = service.contacts, service.health
+    beside = {  # empty: there is none
+        "contacts": contacts.name if contacts is not None else "",
+        "motion": contacts.motion.name if contacts is not None and contacts.motion is not None else "",
+        "health": health.name if health is not None else "",
+    }
     if as_json:
         ready: dict[str, Any] = {"event": "ready", "driver": "calm", "name": service.name}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}
@@ -164,22 +164,4 @@ def _report_ready(service: CalmService, as_json: bool) -> None:
         echo(f"publishing it{services} (skin-top --namespace {service.into.name} shows it, Ctrl-C ends)")
 
 
-def _services_beside(service: CalmService) -> dict[str, str]:
-    """Return the names of the services of contacts, motion and health; empty: there is none."""
-    contacts, health = service.contacts, service.health
-    return {
-        "contacts": contacts.name if contacts is not None else "",
-        "motion": contacts.motion.name if contacts is not None and contacts.motion is not None else "",
-        "health": health.name if health is not None else "",
-    }
-
-
-def _report_status(service: CalmService) -> None:
-    try:
-        print_json({"event": "status", "name": service.name, **service.status()})
-    except BrokenPipeError:
-        service.stop()
-
-
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)

@@ -1,8 +1,11 @@
-"""``skin-convert``: write a recording in the formats of other programs."""
+"""``skin-convert``: write a recording in the formats of other programs, or make one of their data."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
@@ -16,15 +19,10 @@ from skinware.cli._terminal import echo, print_json
 if TYPE_CHECKING:
     from skinware.conversion import Selection
     from skinware.conversion.converting import Converted
-    from skinware.conversion.learning import LearningSet
 
 
 def _window(text: str) -> int:
-    """Return a number of frames; 0: all.
-
-    Raises:
-        click.BadParameter: the text is no such number.
-    """
+    """Return a number of frames; 0: all."""
     if text == "all":
         return 0
     if not text.isdecimal() or not int(text):
@@ -96,38 +94,7 @@ _learning_options = cli.options(
         "--each-structure", is_flag=True, help="lerobot: a set for each structure of the drivers, in folders 1, 2 ..."
     ),
 )
-_NAMES = (
-    *("also", "fps", "task", "episode", "episodes", "gap"),
-    *("window", "join", "match", "within", "at", "each_structure"),
-)
-
-
-def _learning_set(options: Mapping[str, Any]) -> tuple[list[Path], LearningSet]:
-    """Return further recordings, and the set to make of all of them.
-
-    Raises:
-        ConfigurationError: an option is wrong.
-        OSError: the file of episodes cannot be read.
-    """
-    from skinware.conversion.learning import LearningSet, interval_of, join_of, read_intervals
-
-    intervals = [interval_of(text) for text in options["episode"]]
-    if options["episodes"] is not None:
-        intervals += read_intervals(options["episodes"])
-    return list(options["also"]), LearningSet(
-        fps=options["fps"],
-        task=options["task"],
-        window=options["window"],
-        intervals=intervals,
-        gap_s=options["gap"],
-        joins=[join_of(text) for text in options["join"]],
-        match=options["match"],
-        within_s=options["within"],
-        at=options["at"],
-        each_structure=options["each_structure"],
-    )
-
-
+_PROGRESS_S = 2.0
 _FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap", "foxglove", "ros2")
 _WIRE_FORMATS = ("candump", "pcapng")
 _LEARNING_FORMATS = ("lerobot",)
@@ -143,23 +110,28 @@ _LEARNING_FORMATS = ("lerobot",)
     "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
     "skin-convert walk.mcap --to ros2                       a bag of ROS 2",
     "skin-convert pick.mcap --to lerobot --fps 30 --join observation.state=joints.csv    a learning set",
+    "skin-convert data.csv --guess > map.toml               your own data: which columns are taxels?",
+    "skin-convert data.csv --map map.toml --to mcap         a recording of them",
 )
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @click.option(
     "--to",
     "format_name",
     type=click.Choice(_FORMATS + _WIRE_FORMATS + _LEARNING_FORMATS),
-    required=True,
     help="Format to write.",
 )
+@click.option(
+    "--map",
+    "map_file",
+    metavar="MAP",
+    type=cli.FILE,
+    help="FILE is of another program (CSV, NPZ, Parquet, LeRobot, a bag of ROS, YARP's data.log); MAP has its columns.",
+)
+@click.option("--guess", is_flag=True, help="Print a MAP for FILE, with a comment for each guess.")
 @cli.output_option("The new file, or folder for csv, parquet, ros2 and lerobot.  [default: beside FILE]", metavar="OUT")
 @click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; may be repeated.")
-@click.option("--patch", "patches", metavar="PATCH", multiple=True, help="Only sensors of PATCH; may be repeated.")
-@click.option(
-    "--region", "in_regions", metavar="REGION", multiple=True, help="Only sensors in REGION; may be repeated."
-)
-@cli.regions_option
+@cli.parts_options
 @click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
 @_learning_options
@@ -167,7 +139,9 @@ _LEARNING_FORMATS = ("lerobot",)
 def command(
     file: Path,
     names: tuple[str, ...],
-    format_name: str,
+    format_name: str | None,
+    map_file: Path | None,
+    guess: bool,
     output: Path | None,
     types: tuple[str, ...],
     patches: tuple[str, ...],
@@ -180,25 +154,40 @@ def command(
 ) -> None:
     """Write a recording in another format: all drivers and services in it, or only NAME...
 
+    With --map, FILE is data of another program, of which a recording (--to mcap) or another format is made.
+
     candump and pcapng contain the frames on the buses, if they were recorded (skin-record --wire). lerobot is a
     learning set (LeRobot's dataset v3.0): rows at a fixed rate, in episodes, with joints and cameras beside the skin.
 
     FILE does not change; its damaged parts are left out and reported. The new file appears when it is complete.
     """
-    from skinware.conversion import Selection
+    from skinware.conversion import Selection, convert, convert_wires
 
+    if guess:
+        cli.refuse_others("--guess", ["file"])
+        _print_guess(file)
+        return
+    if format_name is None:
+        raise click.UsageError("Missing option '--to'.")
+    if map_file is not None:
+        cli.refuse_others("--map", ["file", "map_file", "format_name", "output", "as_json"])
     selection = Selection(names, types, patches, cli.regions_asked_for(in_regions, region_files), in_regions)
     if end_s is not None and end_s <= start_s:
         raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
     source_of = click.get_current_context().get_parameter_source
-    given = [name for name in _NAMES if source_of(name) is not ParameterSource.DEFAULT]
+    given = [name for name in learning if source_of(name) is not ParameterSource.DEFAULT]
     if given and format_name not in _LEARNING_FORMATS:
         raise click.UsageError(f"--{given[0].replace('_', '-')} is for --to {', '.join(_LEARNING_FORMATS)}")
     stop = Event()
     with cli.signals_end(stop.set):  # not inside a library
-        converted = _written(
-            file, output, format_name, selection, learning, start_s=start_s, end_s=end_s, is_stopped=stop.is_set
-        )
+        time_and_end: dict[str, Any] = {"start_s": start_s, "end_s": end_s, "is_stopped": stop.is_set}
+        if map_file is not None:
+            converted = _imported(file, map_file, output, format_name, stop.is_set)
+        elif format_name in _LEARNING_FORMATS:
+            converted = _learning_set(file, output, selection, learning, time_and_end)
+        else:
+            write = convert_wires if format_name in _WIRE_FORMATS else convert
+            converted = write(file, output, format_name, selection, **time_and_end)
     for note in converted.notes:
         cli.warn(note)
     in_episodes = {"episodes": converted.episodes} if converted.episodes is not None else {}
@@ -210,24 +199,58 @@ def command(
     echo(f"{converted.path}: {frames}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
 
 
-def _written(
-    file: Path,
-    output: Path | None,
-    format_name: str,
-    selection: Selection,
-    learning: dict[str, Any],
-    **time_and_end: Any,
+def _print_guess(file: Path) -> None:
+    from skinware.conversion.foreign import guess, open_source
+
+    with contextlib.closing(open_source(file)) as source:
+        echo(guess(source), nl=False)
+
+
+def _imported(
+    file: Path, map_file: Path, output: Path | None, format_name: str, is_stopped: Callable[[], bool]
 ) -> Converted:
-    from skinware.conversion import convert, convert_wires
+    from skinware.conversion import FORMATS, convert_foreign
 
-    if format_name in _LEARNING_FORMATS:
-        from skinware.conversion.learning import convert_to_learning_set
+    if format_name not in FORMATS:
+        raise click.UsageError(f"--map makes one of {', '.join(FORMATS)}; then convert the recording to {format_name}")
+    shown_s = time.monotonic()
 
-        also, wanted = _learning_set(learning)
-        return convert_to_learning_set([file, *also], output, wanted, selection, **time_and_end)
-    write = convert_wires if format_name in _WIRE_FORMATS else convert
-    return write(file, output, format_name, selection, **time_and_end)
+    def report(share: float) -> None:
+        nonlocal shown_s
+        if time.monotonic() - shown_s >= _PROGRESS_S:
+            shown_s = time.monotonic()
+            cli.warn(f"{file}: {share:.0%}")
+
+    return convert_foreign(file, output, format_name, map_file, report=report, is_stopped=is_stopped)
 
 
-def main() -> None:
-    cli.run(command)
+def _learning_set(
+    file: Path, output: Path | None, selection: Selection, options: dict[str, Any], time_and_end: dict[str, Any]
+) -> Converted:
+    from skinware.conversion.learning import (
+        LearningSet,
+        convert_to_learning_set,
+        interval_of,
+        join_of,
+        read_intervals,
+    )
+
+    intervals = [interval_of(text) for text in options["episode"]]
+    if options["episodes"] is not None:
+        intervals += read_intervals(options["episodes"])
+    wanted = LearningSet(
+        fps=options["fps"],
+        task=options["task"],
+        window=options["window"],
+        intervals=intervals,
+        gap_s=options["gap"],
+        joins=[join_of(text) for text in options["join"]],
+        match=options["match"],
+        within_s=options["within"],
+        at=options["at"],
+        each_structure=options["each_structure"],
+    )
+    return convert_to_learning_set([file, *options["also"]], output, wanted, selection, **time_and_end)
+
+
+main = partial(cli.run, command)

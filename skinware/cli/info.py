@@ -6,6 +6,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -80,9 +81,13 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
             raise click.UsageError("--health stands alone: without --sensors and --watch")
         show([place] if namespace else [place, Namespace(place.calm_name)], name, as_json)
     elif sensors:
+        from skinware.cli._report import sensors as sensors_of
+
         if name is None:
             raise click.UsageError("--sensors lists one driver: give its NAME")
-        _show_sensors(place, name, as_json)
+        rows = sensors_of(place, name)
+        cells = [[str(position), row["name"], row["type"], f"{row['uid']:#x}"] for position, row in enumerate(rows)]
+        say(as_json, rows, "\n".join(table(("position", "name", "type", "uid"), cells, left=3)))
     elif watch:
         _watch(place, name, as_json)
     else:
@@ -93,11 +98,7 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
 
 
 def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
-    """Return the report for people, as lines with colours; on a terminal no line is wider than it.
-
-    Args:
-        brief: patches of a bus without problems share a line.
-    """
+    """Return the report for people, with colours, no wider than the terminal; brief: good patches share a line."""
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
     if not drivers and not services:
@@ -118,13 +119,20 @@ def _table(titles: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> l
 
 
 def _driver_lines(driver: dict[str, Any]) -> list[str]:
+    from skinware.samples import sample_text
+
     counts = [plural(driver["patches"], "patch", "patches"), plural(driver["modules"], "module")]
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])
     units = [f"{count_text(t['sensors'])} {t['name']}{' in ' * bool(t['unit'])}{t['unit']}" for t in driver["types"]]
     untouched = sum(patch["untouched"] for patch in driver["patch_list"])
-    columns = {title: text for title, text in _OF_A_BUS.items() if any(map(text, driver["buses"]))}
+    columns = [title for title in ("reason", "for", "load") if any(_columns_of(bus)[title] for bus in driver["buses"])]
     timed = _TIMES_OF_A_PATCH if any("interval" in patch for patch in driver["patch_list"]) else {}
     timed = {title: key for title, key in timed.items() if any(sum(p[key]["counts"]) for p in driver["patch_list"])}
+    samples = [
+        [bus["name"], words(sample["why"]), sample_text(sample)]
+        for bus in driver["buses"]
+        for sample in bus.get("samples", ())
+    ]
     lines = [
         f"{driver['driver_type'] or 'unnamed'} driver: {size} ({driver['dtype']})",
         f"sensors: {', '.join(units)}{f'; {count_text(untouched)} untouched so far (only 0)' if untouched else ''}",
@@ -132,10 +140,14 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
         *_counter_table(
             driver["buses"],
             ("bus", "state", *columns),
-            lambda bus: (bus["name"], _state(driver, bus), *(text(bus) or NO_VALUE for text in columns.values())),
+            lambda bus: (
+                bus["name"],
+                _state(driver, bus),
+                *(_columns_of(bus)[title] or NO_VALUE for title in columns),
+            ),
             {"frames", "dropped"},
         ),
-        *_sample_lines(driver["buses"]),
+        *(["", *table(("bus", "not used", "for example"), samples, left=3)] if samples else []),
         "",
         *_counter_table(
             driver["patch_list"],
@@ -151,17 +163,13 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
             {"orphans"},
         ),
         *([_ABOUT_TIMES] if timed else []),
-        *_path_lines(driver),
     ]
-    return [_life_line("driver", driver), *_indented([*lines, "", *_statistics_lines(driver), *_reader_lines(driver)])]
-
-
-def _path_lines(driver: dict[str, Any]) -> list[str]:
-    names = ", ".join(bus["name"] for bus in driver["buses"] if bus.get("data_path") == "python")
-    parts = [f"Python receives the frames of {names}"] if names else []
+    in_python = ", ".join(bus["name"] for bus in driver["buses"] if bus.get("data_path") == "python")
+    path = [f"Python receives the frames of {in_python}"] if in_python else []
     if driver["latency_ms"]:
-        parts.append(f"frames wait up to {driver['latency_ms']:g} ms to be taken together")
-    return ["", "; ".join(parts)] if parts else []
+        path.append(f"frames wait up to {driver['latency_ms']:g} ms to be taken together")
+    lines += ["", "; ".join(path)] if path else []
+    return [_life_line("driver", driver), *_indented([*lines, "", *_statistics_lines(driver), *_reader_lines(driver)])]
 
 
 def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
@@ -236,18 +244,15 @@ def _state(driver: dict[str, Any], part: dict[str, Any]) -> str:
     return state_shown(part["state"], part["fresh"], part["sensors"]) if "fresh" in part else part["state"]
 
 
-def _load(bus: dict[str, Any]) -> str | None:
-    if bus.get("load_unknown") == "filter":
-        return "unknown (filter)"
-    return None if bus.get("load") is None else f"{100 * bus['load']:.0f} %"
-
-
-_OF_A_BUS: dict[str, Callable[[dict[str, Any]], str | None]] = {
-    "reason": lambda bus: (bus.get("reason") or "").replace("_", "-"),
-    "for": lambda bus: None if bus.get("state_age_s") is None else age_text(bus["state_age_s"] * 1e9),
-    "load": _load,
-}
-"""Columns of a bus that are shown where any bus has a text for them."""
+def _columns_of(bus: dict[str, Any]) -> dict[str, str]:
+    """Return the texts of a bus that are shown where any bus has one."""
+    age_s, load = bus.get("state_age_s"), bus.get("load")
+    load_text = "" if load is None else f"{100 * load:.0f} %"
+    return {
+        "reason": (bus.get("reason") or "").replace("_", "-"),
+        "for": "" if age_s is None else age_text(age_s * 1e9),
+        "load": "unknown (filter)" if bus.get("load_unknown") == "filter" else load_text,
+    }
 
 
 def _life_line(what: str, entry: dict[str, Any]) -> str:
@@ -296,16 +301,6 @@ def _counter_table(
     )
 
 
-def _sample_lines(buses: list[dict[str, Any]]) -> list[str]:
-    """Return a few of the frames that were not used: identifier, length, first bytes."""
-    from skinware.samples import sample_text
-
-    rows = [
-        [bus["name"], words(sample["why"]), sample_text(sample)] for bus in buses for sample in bus.get("samples", ())
-    ]
-    return ["", *table(("bus", "not used", "for example"), rows, left=3)] if rows else []
-
-
 def _reader_lines(entry: dict[str, Any]) -> list[str]:
     if not entry["readers"]:
         return ["no readers"]
@@ -332,17 +327,6 @@ def _indented(lines: list[str]) -> list[str]:
     return [" " * _INDENT + line if line else "" for line in lines]
 
 
-def _show_sensors(namespace: Namespace, name: str, as_json: bool) -> None:
-    from skinware.cli._report import sensors
-
-    rows = sensors(namespace, name)
-    if as_json:
-        print_json(rows)
-        return
-    cells = [[str(position), row["name"], row["type"], f"{row['uid']:#x}"] for position, row in enumerate(rows)]
-    echo("\n".join(table(("position", "name", "type", "uid"), cells, left=3)))
-
-
 def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
     from skinware.cli._report import report
     from skinware.errors import ServiceNotFound
@@ -363,5 +347,4 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
         time.sleep(_WATCH_PERIOD_S)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -82,13 +84,14 @@ def command(
 
 
 def _the_only_one(namespace: Namespace) -> str:
-    """Return the only service that can be pressed.
+    """Return the only service that can be pressed; refuse none or several."""
+    from skinware.service import ServiceReader
 
-    Raises:
-        ServiceNotFound: there is none.
-        ConfigurationError: there are several.
-    """
-    able = [name for name in namespace.services() if _can_be_pressed(namespace, name)]
+    able = []
+    for name in namespace.services():
+        # one may be dead, hanging, just withdrawn, not readable, or without requests
+        with contextlib.suppress(SkinwareError), ServiceReader(name, namespace=namespace, announce=False) as reader:
+            able += [name] if _OPERATION in reader.operations(timeout_s=_ASK_S) else []
     if not able:
         raise ServiceNotFound(
             f"nothing in the namespace {namespace.name!r} can be pressed: only emulated ROBOSKIN boards can,"
@@ -100,18 +103,7 @@ def _the_only_one(namespace: Namespace) -> str:
     return able[0]
 
 
-def _can_be_pressed(namespace: Namespace, name: str) -> bool:
-    from skinware.service import ServiceReader
-
-    try:
-        with ServiceReader(name, namespace=namespace, announce=False) as reader:
-            return _OPERATION in reader.operations(timeout_s=_ASK_S)
-    except SkinwareError:
-        return False  # dead, hanging, just withdrawn, not readable, or without requests
-
-
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)
 
 
 if __name__ == "__main__":

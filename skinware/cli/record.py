@@ -13,13 +13,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import are_terminals, echo, print_json
 
 if TYPE_CHECKING:
     from skinware.recording.files import Target
@@ -28,15 +29,10 @@ if TYPE_CHECKING:
 _LOOK_S = 0.1
 
 
-def has_enter() -> bool:
-    """Return whether a person can press Enter: there is a terminal."""
-    return sys.stdin is not None and sys.stdin.isatty()
-
-
 @contextlib.contextmanager
 def on_enter(call: Callable[[], object]) -> Iterator[None]:
     """Call a function in another thread whenever Enter is pressed in this block; do nothing without a terminal."""
-    if not has_enter():
+    if not are_terminals(sys.stdin):
         yield
         return
     ended, fd = threading.Event(), sys.stdin.fileno()
@@ -71,11 +67,7 @@ _TIME = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min)?")
 
 
 def size(text: str) -> int:
-    """Return a number of bytes: ``500MB``, ``2GiB``; for ``click.option(type=...)``.
-
-    Raises:
-        click.BadParameter: the text is no such number.
-    """
+    """Return a number of bytes: ``500MB``, ``2GiB``; for ``click.option(type=...)``."""
     found = _SIZE.fullmatch(text)
     if not found or found[2] not in _UNITS or not float(found[1]):
         raise click.BadParameter(f"{text!r} is not a size: give bytes, or a number with kB, MB, GB, MiB or GiB.")
@@ -83,11 +75,7 @@ def size(text: str) -> int:
 
 
 def past(text: str) -> float:
-    """Return a time: ``60``, ``60s``, ``5min``; for ``click.option(type=...)``.
-
-    Raises:
-        click.BadParameter: the text is no such time.
-    """
+    """Return a time in seconds: ``60``, ``60s``, ``5min``; for ``click.option(type=...)``."""
     found = _TIME.fullmatch(text)
     if not found or not float(found[1]):
         raise click.BadParameter(f"{text!r} is not a time: give seconds, or minutes as in 5min.")
@@ -102,7 +90,7 @@ def past(text: str) -> float:
     "skin-record --last 60s               Enter, or kill -USR1, saves the last minute",
     "skin-record --wire                   also the frames on the buses, for skin-replay --wire",
 )
-@click.argument("names", metavar="[NAME]...", nargs=-1)
+@cli.names_argument
 @cli.output_option("The new file.  [default: skin-DATE-TIME.mcap]")
 @cli.duration_option()
 @click.option(
@@ -205,7 +193,7 @@ class _Progress:
             print_json({"event": "ready", "file": str(self._path), "namespace": namespace, "names": list(names)})
         else:
             what = ", ".join(names) or "all drivers and services"
-            keys = f"{'Enter saves, ' * (is_past and has_enter())}Ctrl-C ends"
+            keys = f"{'Enter saves, ' * (is_past and are_terminals(sys.stdin))}Ctrl-C ends"
             echo(f"recording {what} of namespace {namespace!r} into {self._path} ({keys})")
 
     def status(self) -> None:
@@ -233,14 +221,17 @@ class _Progress:
             if self._as_json:
                 with contextlib.suppress(BrokenPipeError):
                     print_json(event)
-            cli.warn(_text_of(event))
+            if event["event"] == "unreadable":
+                cli.warn(f"{event['service']} is not recorded: {event['why']}")
+            elif "for_ns" in event:
+                suspended_s = event["for_ns"] / 1e9
+                cli.warn(f"the machine was suspended for {suspended_s:.1f} s: nothing was recorded meanwhile")
+            else:
+                set_s = event["by_ns"] / 1e9
+                cli.warn(f"the wall clock was set by {set_s:+.1f} s: times in the file go on as before")
 
     def stopped(self, *, is_complete: bool) -> None:
-        """Report the end.
-
-        Args:
-            is_complete: everything that was taken is in the files; otherwise an error follows.
-        """
+        """Report the end: everything that was taken is in the files, or else an error follows."""
         self._news()
         messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
         if self._as_json:
@@ -259,16 +250,7 @@ class _Progress:
         return {"messages": messages, "missed": self._recorder.missed, "bytes": self._target.size}
 
 
-def _text_of(event: dict[str, Any]) -> str:
-    if event["event"] == "unreadable":
-        return f"{event['service']} is not recorded: {event['why']}"
-    if "for_ns" in event:
-        return f"the machine was suspended for {event['for_ns'] / 1e9:.1f} s: nothing was recorded meanwhile"
-    return f"the wall clock was set by {event['by_ns'] / 1e9:+.1f} s: times in the file go on as before"
-
-
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)
 
 
 if __name__ == "__main__":

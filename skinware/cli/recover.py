@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 import click
@@ -38,5 +39,4 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
     echo(f"{target}: written; {what}")
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, overwrite, print_json, say, terminal_width
+from skinware.cli._terminal import are_terminals, echo, overwrite, print_json, say, terminal_width
 from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
-    from skinware.recording import Recording
     from skinware.recording.replaying import Replayer
 
 KEYS = "space: pause   . , : a frame on, back   arrows: 5 s, 1 min   + - 1: speed   l: loop   0: begin   q: end"
@@ -53,8 +52,7 @@ class Terminal:
     @property
     def is_ours(self) -> bool:
         """Whether keys arrive here: there is a terminal, and this program is in its foreground."""
-        streams = (sys.stdin, sys.stdout)
-        if not all(stream is not None and stream.isatty() for stream in streams):
+        if not are_terminals(sys.stdin, sys.stdout):
             return False
         with contextlib.suppress(OSError):
             return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
@@ -66,7 +64,10 @@ class Terminal:
         try:
             yield
         finally:
-            self._give_back()
+            self._replayer.unwatch(0)
+            if self._before is not None and self.is_ours:
+                termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._before)  # type: ignore[arg-type]
+                echo()
 
     def take(self) -> None:
         """Read keys from now on, if that is possible; called again after a stop (SIGCONT)."""
@@ -96,12 +97,6 @@ class Terminal:
             *[f"{state['late']} late"] * bool(state["late"]),
         ]
         return "  ".join(words)[: max(0, width - 1)]
-
-    def _give_back(self) -> None:
-        self._replayer.unwatch(0)
-        if self._before is not None and self.is_ours:
-            termios.tcsetattr(sys.stdin.fileno(), termios.TCSADRAIN, self._before)  # type: ignore[arg-type]
-            echo()
 
     def _hear(self) -> None:
         try:
@@ -155,7 +150,11 @@ def publish_again(file: Path, names: Sequence[str], namespace: str | None, pace:
         has_keys = not as_json and terminal.is_ours
         continued = {signal.SIGCONT: terminal.take} if has_keys else {}
         with contextlib.closing(replayer), cli.signals_end(replayer.stop, continued):
-            _ready(recording, names, place.name, as_json)
+            published = list(names or recording.services)
+            ready: dict[str, Any] = {"event": "ready", "file": str(file), "namespace": place.name, "names": published}
+            ready |= {"duration_s": recording.duration_s, "is_whole": recording.is_whole}
+            text = f"{file}, {recording.duration_s:.1f} s: {', '.join(published) or 'nothing'} in"
+            say(as_json, ready, f"{text} namespace {place.name!r} (Ctrl-C ends)")
             if has_keys:
                 echo(KEYS)
                 with terminal.keys():
@@ -168,11 +167,7 @@ def publish_again(file: Path, names: Sequence[str], namespace: str | None, pace:
 
 
 def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
-    """Keep recorded frames apart from living ones; only warn if the namespace was given as an option.
-
-    Raises:
-        ConfigurationError: services run in the default namespace.
-    """
+    """Keep recorded frames apart from living ones; only warn if the namespace was given as an option."""
     from skinware.service import ServiceReader
 
     living = []
@@ -188,14 +183,6 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
             f"{run} in namespace {place.name!r}: give another one with --namespace, or"
             f" --namespace {place.name} to publish beside them"
         )
-
-
-def _ready(recording: Recording, names: Sequence[str], namespace: str, as_json: bool) -> None:
-    published = list(names or recording.services)
-    ready: dict[str, Any] = {"event": "ready", "file": str(recording.path), "namespace": namespace, "names": published}
-    ready |= {"duration_s": recording.duration_s, "is_whole": recording.is_whole}
-    text = f"{recording.path}, {recording.duration_s:.1f} s: {', '.join(published) or 'nothing'} in"
-    say(as_json, ready, f"{text} namespace {namespace!r} (Ctrl-C ends)")
 
 
 def _report(event: str, replayer: Replayer, as_json: bool) -> None:

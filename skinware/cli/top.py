@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import echo, print_json
+from skinware.cli._terminal import are_terminals, echo, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -47,7 +48,7 @@ _NEEDED = "textual>=8"
     help="Colour scale at the start: change from the baseline, range of the type, or raw counts.",
 )
 @click.option("--region", metavar="NAME", help="Draw only sensors in this region at first.")
-@cli.regions_option
+@cli.regions_option()
 @cli.namespace_option
 @cli.json_option
 @click.pass_context
@@ -71,7 +72,7 @@ def command(
     place = Namespace(namespace)
     names = () if region is None else (region,)
     regions = cli.regions_of(region_files, names) if names or region_files else None
-    if not plain and not as_json and _on_terminal():
+    if not plain and not as_json and are_terminals(sys.stdin, sys.stdout, sys.stderr):  # Textual draws on stderr
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
 
@@ -102,12 +103,6 @@ def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = F
         overview.close()
 
 
-def _on_terminal() -> bool:
-    """Return whether there are a keyboard and a screen (Textual draws on stderr)."""
-    streams = (sys.stdin, sys.stdout, sys.stderr)
-    return all(stream is not None and stream.isatty() for stream in streams)
-
-
 def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: bool) -> None:
     from skinware import bridge_state
     from skinware.cli._top_rows import as_data, contact_data, contact_text, plain_line
@@ -127,5 +122,4 @@ def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: boo
         echo(bridge_state.summary(bridge.robot, bridge_state.as_data(bridge)))
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -17,6 +17,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -38,11 +39,7 @@ _TOKEN = re.compile(r"[A-Za-z0-9_.~-]+")
 
 
 def token_text(text: str) -> str:
-    """Return a token that needs no quoting in an address; for ``click.option(type=...)``.
-
-    Raises:
-        click.BadParameter: it would need quoting.
-    """
+    """Return a token that needs no quoting in an address; for ``click.option(type=...)``."""
     if not _TOKEN.fullmatch(text):
         raise click.BadParameter("give letters, digits, '_', '.', '~' or '-'.")
     return text
@@ -69,24 +66,14 @@ def token_text(text: str) -> str:
     type=token_text,
     help="Token that the address needs.  [default: a random one, if other machines can connect]",
 )
-@click.option(
-    "--tls",
-    metavar="DIR",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Serve https; DIR has cert.pem and key.pem.",
-)
+@cli.tls_option("Serve https; DIR has cert.pem and key.pem.")
 @click.option(
     "--calm",
     "calm_name",
     metavar="NAMESPACE",
     help="Namespace of calmed drivers and their contacts.  [default: that of skin-calm]",
 )
-@click.option(
-    "--links",
-    metavar="FILE",
-    type=cli.FILE,
-    help="Links of the robot: places of coordinate frames, and meshes; TOML or URDF.",
-)
+@cli.links_option("Links of the robot: places of coordinate frames, and meshes; TOML or URDF.")
 @click.option("--no-browser", is_flag=True, help="Only print the address.")
 @cli.namespace_option
 @cli.json_option
@@ -110,6 +97,7 @@ def command(
     """
     if find_spec("websockets") is None:
         raise MissingExtra("skin-view needs a package that is not installed: pip install 'skinware[view]'")
+    import skinware.recording
     from skinware.memory.namespace import Namespace, check_name
     from skinware.views.access import Access, is_loopback
     from skinware.views.following import Follower, Origin
@@ -119,7 +107,9 @@ def command(
     files = [Path(name) for name in names if name.endswith(SUFFIX) or "/" in name]
     names = tuple(name for name in names if Path(name) not in files)
     for file in files:
-        _check(file)
+        with skinware.recording.open(file) as recording:
+            for problem in recording.problems:
+                cli.warn(f"{file}: {problem}")
     for name in names:
         check_name(name, "driver")
     place = Namespace(namespace)
@@ -150,25 +140,13 @@ def command(
     try:
         asyncio.run(_serve(follower, access, RecordingFiles(files, names=names), context, host, port, ready))
     except OSError as error:
-        where = f"{host}, port {DEFAULT_PORT if port is None else port}"
-        echo(f"skin-view: {where}: {_why(error)}", err=True)
+        why = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error.strerror or error)
+        if error.errno == errno.EADDRINUSE:
+            why = "in use: give another --port, or 0 for any that is free"
+        echo(f"skin-view: {host}, port {DEFAULT_PORT if port is None else port}: {why}", err=True)
         click.get_current_context().exit(cli.EXIT_FAILED)
     finally:
         follower.close()
-
-
-def _check(file: Path) -> None:
-    """Warn of damage in a recording.
-
-    Raises:
-        BadRecording: it is not a recording.
-        OSError: it cannot be read.
-    """
-    import skinware.recording
-
-    with skinware.recording.open(file) as recording:
-        for problem in recording.problems:
-            cli.warn(f"{file}: {problem}")
 
 
 async def _serve(
@@ -200,12 +178,6 @@ async def _serve(
         await server.show(host, 0, ready, stop)
 
 
-def _why(error: OSError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return "in use: give another --port, or 0 for any that is free"
-    return os.strerror(error.errno) if error.errno and error.errno > 0 else str(error.strerror or error)
-
-
 def addresses(host: str) -> list[str]:
     """Return the names and addresses at which other machines, or this one, reach a server that listens at ``host``."""
     if host not in ("0.0.0.0", "::"):
@@ -233,12 +205,7 @@ def qr_text(url: str) -> str:
 
 
 def tls_context(folder: Path) -> ssl.SSLContext:
-    """Return what a server of https needs, from ``cert.pem`` and ``key.pem`` in a folder.
-
-    Raises:
-        ConfigurationError: a file is missing or no such thing, they do not belong together, or the certificate is not
-            valid today.
-    """
+    """Return what a server of https needs, from ``cert.pem`` and ``key.pem`` in a folder; refuse any other."""
     certificate, key = folder / "cert.pem", folder / "key.pem"
     for file in (certificate, key):
         if not file.is_file():
@@ -274,5 +241,4 @@ def _refused(server: ssl.SSLContext, certificate: Path) -> str:
     return ""
 
 
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)

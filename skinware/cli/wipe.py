@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -90,23 +91,29 @@ class _Wipe:
         needed = threshold(self._rest.noise(self._type.name))
         what = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit}
         more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
-        tested = plural(len(self._tested()), f"{self._type.name} sensor")
-        ready = {"event": "ready", **what, "threshold": needed, "sensors": len(self._tested())}
-        say(self._as_json, ready, f"{self._reader.name}: press your way over {tested}, {more} each (Ctrl-C ends)")
+        tested = self._count()[0]
+        ready = {"event": "ready", **what, "threshold": needed, "sensors": tested}
+        sensors = plural(tested, f"{self._type.name} sensor")
+        say(self._as_json, ready, f"{self._reader.name}: press your way over {sensors}, {more} each (Ctrl-C ends)")
         is_due = after(_REPORT_EVERY_S)
         for frame, physical in self._frames(duration_s):
             self._test.follow(physical, frame.status == 0)
-            is_complete = not len(self._never_answered())
-            if is_complete or is_due():
+            tested, never = self._count()
+            if not never or is_due():
                 is_due = after(_REPORT_EVERY_S)
-                self._report_progress()
-            if is_complete:
+                answered = tested - len(never)
+                text = f"{count_text(answered)} of {count_text(tested)} answered"
+                if self._is_redrawing:
+                    overwrite(text)
+                else:
+                    say(self._as_json, {"event": "wiping", "answered": answered, "sensors": tested}, text)
+            if not never:
                 return
 
     def report_result(self) -> bool:
         """List the sensors that never answered, and return whether all did."""
-        never = self._never_answered().tolist()
-        answered = len(self._tested()) - len(never)
+        tested, never = self._count()
+        answered = tested - len(never)
         named = [
             {
                 "name": self._structure.sensor_name(position),
@@ -117,29 +124,25 @@ class _Wipe:
             for position in never
         ]
         if self._as_json:
-            print_json({"event": "done", "answered": answered, "sensors": len(self._tested()), "never": named})
+            print_json({"event": "done", "answered": answered, "sensors": tested, "never": named})
         else:
-            echo("\n" * self._is_redrawing + self._progress() + (", never:" if never else ""))
+            text = f"{count_text(answered)} of {count_text(tested)} answered"
+            echo("\n" * self._is_redrawing + text + (", never:" if never else ""))
             for position in never:
                 status = int(self._status[position])
                 why = f" ({status_text(status)})" if status else ""
                 echo(f"  {self._structure.sensor_name(position)}{why}")
         return not never
 
-    def _tested(self) -> npt.NDArray[np.int64]:
+    def _count(self) -> tuple[int, list[int]]:
+        """Return how many sensors are tested, and the positions of those that have not answered so far."""
         import numpy as np
 
         from skinware.status import Status
 
-        positions = np.arange(self._structure.n_sensors)[self._structure.index(self._type.name)]
-        tested: npt.NDArray[np.int64] = positions[(self._status[positions] & np.uint8(Status.MASKED)) == 0]
-        return tested
-
-    def _never_answered(self) -> npt.NDArray[np.int64]:
-        import numpy as np
-
+        is_tested = (self._status & np.uint8(Status.MASKED)) == 0
         never = self._test.never_moved(self._type.name, self._rest.noise(self._type.name))
-        return never[np.isin(never, self._tested())]
+        return int(is_tested[self._structure.index(self._type.name)].sum()), never[is_tested[never]].tolist()
 
     def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverSnapshot, npt.NDArray[np.float32]]]:
         """Yield snapshots with their (n_sensors,) physical values."""
@@ -150,19 +153,5 @@ class _Wipe:
             self._status = frame.status
             yield frame, physical_values(frame)
 
-    def _progress(self) -> str:
-        answered = len(self._tested()) - len(self._never_answered())
-        return f"{count_text(answered)} of {count_text(len(self._tested()))} answered"
 
-    def _report_progress(self) -> None:
-        if self._as_json:
-            answered = len(self._tested()) - len(self._never_answered())
-            print_json({"event": "wiping", "answered": answered, "sensors": len(self._tested())})
-        elif self._is_redrawing:
-            overwrite(self._progress())
-        else:
-            echo(self._progress())
-
-
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -131,10 +131,7 @@ def is_wished(namespace: Namespace, what: str) -> bool:
 
 
 def sweep(namespace: Namespace) -> None:
-    """Remove what dead readers left behind, as far as this user may.
-
-    It is bounded, however many files somebody puts there. The next look goes on.
-    """
+    """Remove what dead readers left, as far as this user may, and not more than a look may take."""
     for _ in _living(namespace):
         pass
 
@@ -168,16 +165,12 @@ def _read(fd: int) -> ReaderRecord | None:
         data = os.pread(fd, _SIZE, 0)
         if data[:8] == b"%08x" % zlib.crc32(data[9:]):
             try:
-                return _printable(msgspec.json.decode(data[9:], type=ReaderRecord))
+                record = msgspec.json.decode(data[9:], type=ReaderRecord)
             except (msgspec.MsgspecError, ValueError, RecursionError):
                 return None
+            for name in ("service", "program", "kind"):  # texts of others, for terminals
+                text: str = getattr(record, name)
+                if not text.isprintable():
+                    setattr(record, name, ascii(text)[1:-1])
+            return record
     return None
-
-
-def _printable(record: ReaderRecord) -> ReaderRecord:
-    """Make the texts harmless for the terminals of programs that show them."""
-    for name in ("service", "program", "kind"):
-        text: str = getattr(record, name)
-        if not text.isprintable():
-            setattr(record, name, ascii(text)[1:-1])
-    return record

@@ -194,9 +194,6 @@ def plan(
         slot_count: 2 to 64; None: as many as the period asks for.
         period_ns: the writer's nominal period. Slots then hold a second, but take at most 16 MiB; there are at least 8.
             0: it has none, and there are 8.
-
-    Raises:
-        ConfigurationError: a slot count or a column that the format cannot hold.
     """
     if slot_count is not None and not MIN_SLOTS <= slot_count <= MAX_SLOTS:
         raise ConfigurationError(f"slots={slot_count}: give {MIN_SLOTS} to {MAX_SLOTS}")
@@ -254,9 +251,6 @@ def parse(head: bytes, path: str, file_size: int) -> tuple[np.void, FileLayout]:
 
     Returns:
         The header row, and a layout in which every column lies inside the file.
-
-    Raises:
-        BadServiceFile: anything that this version cannot read safely; the message says what.
     """
 
     def refuse(why: str) -> BadServiceFile:

@@ -49,14 +49,9 @@ class Timespec(ctypes.Structure):
     _fields_ = [("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long)]
 
 
-def _number() -> int:
-    try:
-        return _SYS_FUTEX[platform.machine()]
-    except KeyError:
-        raise PlatformError(f"the futex system call number of {platform.machine()} is not known here") from None
-
-
-_sys_futex = ctypes.c_long(_number())
+if platform.machine() not in _SYS_FUTEX:
+    raise PlatformError(f"the futex system call number of {platform.machine()} is not known here")
+_sys_futex = ctypes.c_long(_SYS_FUTEX[platform.machine()])
 _wake = ctypes.c_int(_FUTEX_WAKE)
 _wait = ctypes.c_int(_FUTEX_WAIT)
 _all_waiters = ctypes.c_int(_EVERYBODY)
@@ -66,14 +61,11 @@ class Word:
     """A futex word in an array, which it keeps mapped. Not for several threads at once.
 
     After a sleep the processor's caches are cold, and each object that need not be touched then is time saved:
-    the arguments of the system calls are made here, and what could go wrong with them is found here.
+    the arguments of the system calls are made here, and what could go wrong with them is found here (OSError).
 
     Args:
         memory: (n,) uint8.
         offset: of the word in it, bytes.
-
-    Raises:
-        OSError: the kernel refuses the address.
     """
 
     def __init__(self, memory: npt.NDArray[np.uint8], offset: int) -> None:
@@ -143,12 +135,7 @@ def wait_any(words: Sequence[tuple[Word, int]], deadline_ns: int) -> bool:
 
 
 def sleep_on(words: Sequence[tuple[Word, int]], until_ns: int) -> None:
-    """Sleep until any of some words changes or the time comes; may return early.
-
-    Args:
-        words: with what is expected in each; none, and any number.
-        until_ns: CLOCK_MONOTONIC ns.
-    """
+    """Sleep until any of some words, none or any number, is not as expected, or until a time; may return early."""
     remaining_ns = max(0, until_ns - now_ns())
     if len(words) == 1:
         word, expected = words[0]

@@ -52,7 +52,7 @@ class ForkGuard:
 
     @classmethod
     def abandon_all(cls) -> None:
-        """Run by fork() in the child: all of them, whatever goes wrong with one."""
+        """Abandon all in a forked child, whatever goes wrong with one."""
         with contextlib.ExitStack() as stack:
             for guarded in list(cls._all):
                 stack.callback(guarded.abandon)
@@ -62,29 +62,23 @@ os.register_at_fork(after_in_child=ForkGuard.abandon_all)
 
 
 class Descriptor(ForkGuard):
-    """An open file descriptor that a forked child gives up."""
+    """An open file descriptor that a forked child gives up.
+
+    Attributes:
+        fd: the descriptor, or -1 once closed (by ``close`` or because this process was forked).
+    """
 
     def __init__(self, fd: int) -> None:
-        self._fd = fd
+        self.fd = fd
         super().__init__()
-
-    @property
-    def fd(self) -> int:
-        """The descriptor, or -1 once closed (by ``close`` or because this process was forked)."""
-        return self._fd
 
     def close(self) -> None:
         """Close it, which also lets go of its lock. Idempotent."""
-        fd, self._fd = self._fd, -1
+        fd, self.fd = self.fd, -1
         if fd >= 0:
             os.close(fd)
 
-    def abandon(self) -> None:
-        """See :class:`ForkGuard`."""
-        self.close()
-
-    def __del__(self) -> None:
-        self.close()
+    abandon = __del__ = close
 
 
 UNKNOWN, ENDED = -1, -2
@@ -122,14 +116,14 @@ class ProcessWatch(Descriptor):
         if process is None or process.pid_namespace != _pid_namespace() or not _proc_is_ours():
             return
         try:
-            self._fd = os.pidfd_open(process.pid)
+            self.fd = os.pidfd_open(process.pid)
         except ProcessLookupError:
             self._has_ended = True
         except (OSError, OverflowError):
             return
         else:
             self._poll = select.poll()
-            self._poll.register(self._fd, select.POLLIN)
+            self._poll.register(self.fd, select.POLLIN)
             start_ticks = _start_ticks(process.pid)
             if start_ticks and process.start_ticks and start_ticks != process.start_ticks:  # another has its number now
                 self.close()
@@ -137,13 +131,13 @@ class ProcessWatch(Descriptor):
 
     def has_ended(self) -> bool:
         """Return whether the process is known to have ended; False where that cannot be known, or once closed."""
-        if self._fd >= 0:
+        if self.fd >= 0:
             return bool(self._poll.poll(0))
         return self._has_ended
 
     @property
     def fd_for_c(self) -> int:
-        return ENDED if self._has_ended else self._fd
+        return ENDED if self._has_ended else self.fd
 
 
 def has_ended(process: Process) -> bool:

@@ -8,7 +8,6 @@ import re
 import secrets
 import struct
 import time
-from pathlib import Path
 
 from skinware.errors import NameInUse, NamespaceError
 from skinware.memory.locks import Descriptor, Process, has_ended, this_process, try_lock
@@ -27,9 +26,9 @@ _ORPHAN_S = 2.0
 def take_name(namespace: Namespace, name: str) -> Descriptor:
     """Become the owner of a service's name, for as long as the returned descriptor is open.
 
-    What the owner before left half made or cannot take back (it was killed) is removed. A child of a killed owner may
-    still have the lock: for a moment where Python forked it, which is waited for, and as long as it lives where C did;
-    its lock's file is then replaced.
+    What the owner before left half made or cannot take back (it was killed) is removed, but for the ring: readers still
+    want its last sample. A child of a killed owner may still have the lock: for a moment where Python forked it, which
+    is waited for, and as long as it lives where C did; its lock's file is then replaced.
 
     Raises:
         NameInUse: a living process owns it.
@@ -38,9 +37,15 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
     path = namespace.lock_path(name)
     deadline = time.monotonic() + _ORPHAN_S
     while True:
-        descriptor = _opened_lock(path)
+        try:
+            descriptor = Descriptor(os.open(path, OPEN_FLAGS | os.O_RDWR | os.O_CREAT, 0o600))
+        except OSError as error:
+            raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
         if try_lock(descriptor.fd):
-            _note_holder(descriptor.fd, path)
+            try:
+                os.pwrite(descriptor.fd, _HOLDER.pack(*this_process()), _COUNT.size)
+            except OSError as error:
+                raise NamespaceError(f"cannot write the lock {path}: {error.strerror}") from None
             if current_inode(path) == inode_of(descriptor.fd):
                 break  # otherwise it was removed or replaced meanwhile
         elif not _holder_has_ended(descriptor.fd):
@@ -54,26 +59,15 @@ def take_name(namespace: Namespace, name: str) -> Descriptor:
         else:
             time.sleep(0.005)
         descriptor.close()
+    leftover = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)|{re.escape(name)}\.sock")
     try:
-        _remove_leftovers(namespace, name)
+        for entry in os.listdir(namespace.path):
+            if leftover.fullmatch(entry):
+                os.unlink(namespace.path / entry)
     except OSError as error:
         descriptor.close()
         raise NamespaceError(f"cannot remove what a dead {name!r} left in {namespace.path}: {error.strerror}") from None
     return descriptor
-
-
-def _opened_lock(path: Path) -> Descriptor:
-    try:
-        return Descriptor(os.open(path, OPEN_FLAGS | os.O_RDWR | os.O_CREAT, 0o600))
-    except OSError as error:
-        raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
-
-
-def _note_holder(fd: int, path: Path) -> None:
-    try:
-        os.pwrite(fd, _HOLDER.pack(*this_process()), _COUNT.size)
-    except OSError as error:
-        raise NamespaceError(f"cannot write the lock {path}: {error.strerror}") from None
 
 
 def _holder_has_ended(fd: int) -> bool:
@@ -100,17 +94,6 @@ def _replace_lock(namespace: Namespace, name: str, held: Descriptor) -> None:
         with contextlib.suppress(OSError):
             os.unlink(temporary)
         raise NamespaceError(f"cannot replace the lock {path}: {error.strerror}") from None
-
-
-def _remove_leftovers(namespace: Namespace, name: str) -> None:
-    """Remove what a writer that was killed left half made, and its socket; the caller owns the name.
-
-    The ring stays until another takes its place: readers still want its last sample.
-    """
-    pattern = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)|{re.escape(name)}\.sock")
-    for entry in os.listdir(namespace.path):
-        if pattern.fullmatch(entry):
-            os.unlink(namespace.path / entry)
 
 
 def published_so_far(name_lock: Descriptor, last: Segment | None) -> int:

@@ -30,21 +30,17 @@ _HEADER_WORDS = file_layout.SLOT.itemsize // 8
 
 
 class FrameSource(Protocol):
-    """The generation of a sample: one that is read live, or one that was recorded."""
+    """The generation of a sample: one that is read live, or one that was recorded.
+
+    Attributes:
+        columns: (shape, dtype, offset in the slot) of every column, by name.
+        period_ns: the writer's nominal period, 0 if it has none.
+    """
 
     context: object
-
-    @property
-    def columns(self) -> dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]:
-        """(shape, dtype, offset in the slot) of every column, by name."""
-
-    @property
-    def generation(self) -> int:
-        """Its number."""
-
-    @property
-    def period_ns(self) -> int:
-        """The writer's nominal period, 0 if it has none."""
+    columns: dict[str, tuple[tuple[int, ...], np.dtype[Any], int]]
+    generation: int
+    period_ns: int
 
 
 class Sample:

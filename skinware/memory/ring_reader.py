@@ -41,11 +41,7 @@ _ANY = ctypes.c_uint64(0)
 
 
 class Turn(NamedTuple):
-    """One turn of a loop that takes samples.
-
-    Attributes:
-        cpu_ns: CPU time of the thread at the end; 0 if it was not asked for.
-    """
+    """One turn of a loop that takes samples; ``cpu_ns`` of the thread at its end is 0 if it was not asked for."""
 
     acquired_ns: int
     taken_ns: int
@@ -54,11 +50,7 @@ class Turn(NamedTuple):
 
 
 class Turns(NamedTuple):
-    """The turns that C took since they were last settled.
-
-    Attributes:
-        last: sequence of the last sample taken.
-    """
+    """The turns that C took since they were last settled, and the sequence of the last sample."""
 
     frames: int
     missed: int
@@ -138,20 +130,11 @@ class Take(Generic[SampleT]):
         self._turn = 0
         self._state_of_one = rings[0].state_in_c if is_loop else None
         self._words = rings[0].words
-        self._state = TakeState(len(rings), is_loop, NEWER, 0, _NEVER_NS, 0, 0, os.getpid())
-        self._state_at = ctypes.byref(self._state)
+        self.state_in_c = TakeState(len(rings), is_loop, NEWER, 0, _NEVER_NS, 0, 0, os.getpid())
+        self._state_at = ctypes.byref(self.state_in_c)
         self._wanted, self._timeout_ns = NEWER, 0
-        for place, ring, start in zip(self._state.places, rings, self._starts, strict=False):
+        for place, ring, start in zip(self.state_in_c.places, rings, self._starts, strict=False):
             place.reader, place.start = ctypes.addressof(ring.state_in_c), start
-
-    @property
-    def begun_ns(self) -> int:
-        """When the last ``next`` began, CLOCK_MONOTONIC ns."""
-        return int(self._state.begun_ns)
-
-    def leave_until(self, until_ns: int) -> None:
-        """Set when Python has something to do at the latest, CLOCK_MONOTONIC ns."""
-        self._state.until_ns = until_ns
 
     def free(self) -> _Piece:
         """Return memory that no sample uses."""
@@ -185,8 +168,8 @@ class Take(Generic[SampleT]):
         """
         piece = self.free()
         if wanted != self._wanted or timeout_ns != self._timeout_ns:
-            self._wanted = self._state.wanted = wanted
-            self._timeout_ns = self._state.timeout_ns = timeout_ns
+            self._wanted = self.state_in_c.wanted = wanted
+            self._timeout_ns = self.state_in_c.timeout_ns = timeout_ns
         one = self._state_of_one
         if one is not None and self._words[LATEST] == one.last:
             result = _NO_NEWS
@@ -200,11 +183,7 @@ class Take(Generic[SampleT]):
 
 
 class RingReader(Generic[SampleT]):
-    """The reader's end of one generation: it reads only, takes no lock, and the writer does not know it.
-
-    Args:
-        context: what every sample carries as ``context``.
-    """
+    """The reader's end of one generation: it reads only, takes no lock, and the writer does not know it."""
 
     def __init__(self, segment: Segment, frame_class: type[SampleT], context: object = None) -> None:
         self.frame_class = frame_class
@@ -217,6 +196,7 @@ class RingReader(Generic[SampleT]):
         self._half_words = segment.data.data.cast("I")
         self.wake_word: futex.Word = futex.Word(segment.data, file_layout.WAKE_WORD_OFFSET)
         self._slots = slots_of(segment)
+        self.slot_count: int = len(self._slots)
         self._slot_words = slot_headers_of(segment)
         self.state_in_c = ReaderState.of(segment)
         self.state_in_c.descriptor, self.state_in_c.writer = segment.descriptor.fd, segment.maker.fd_for_c
@@ -227,10 +207,6 @@ class RingReader(Generic[SampleT]):
     def latest(self) -> int:
         """Sequence of the newest sample, 0 before the first."""
         return self.words[LATEST]
-
-    @property
-    def slot_count(self) -> int:
-        return len(self._slots)
 
     @property
     def state(self) -> int:
@@ -244,17 +220,7 @@ class RingReader(Generic[SampleT]):
         return count
 
     def copy(self, sequence: int | None = None) -> SampleT | None:
-        """Return a private copy of a sample.
-
-        Args:
-            sequence: which one; default: the newest.
-
-        Returns:
-            None if nothing was published yet, or the sample asked for is no longer in the ring.
-
-        Raises:
-            Overrun: the newest sample was overwritten while it was copied, 64 times in a row.
-        """
+        """Return a copy of the newest sample, or of another; None if there is none, or it is no longer in the ring."""
         piece = self.take.free()
         result = _copy(self._state_at, _ANY if sequence is None else ctypes.c_uint64(sequence), piece.in_c)
         if result == _NEWS:
@@ -270,7 +236,7 @@ class RingReader(Generic[SampleT]):
             )
         return Overrun(
             f"{self.segment.path}: the writer was faster {COPY_ATTEMPTS} times in a row; "
-            f"give the service more slots (it has {len(self._slots)}) or publish less often"
+            f"give the service more slots (it has {self.slot_count}) or publish less often"
         )
 
     def resume_turns(self, last: int, until_ns: int, turn: tuple[int, int] | None) -> None:
@@ -284,7 +250,7 @@ class RingReader(Generic[SampleT]):
         state = self.state_in_c
         state.last = last
         state.acquired_ns, state.taken_ns = turn or (0, 0)
-        self.take.leave_until(until_ns)
+        self.take.state_in_c.until_ns = until_ns
 
     def settle_turns(self) -> Turns | None:
         """Return the turns taken in C since the last call; None if there were none."""
@@ -306,15 +272,11 @@ class RingReader(Generic[SampleT]):
         return self.words[MISSED_PERIODS]
 
     def times_ns(self, word: int) -> list[tuple[int, int]]:
-        """Return (sequence, time) of the samples that the ring still holds, oldest first.
-
-        Args:
-            word: ``PUBLISHED`` or ``ACQUIRED``.
-        """
+        """Return (sequence, ``PUBLISHED`` or ``ACQUIRED`` time) of the samples in the ring, oldest first."""
         times = []
         latest = self.latest
-        for sequence in range(max(1, latest - len(self._slots) + 2), latest + 1):
-            words = self._slot_words[sequence % len(self._slots)]
+        for sequence in range(max(1, latest - self.slot_count + 2), latest + 1):
+            words = self._slot_words[sequence % self.slot_count]
             time_ns = words[word]
             fence()
             if words[SEQUENCE] == sequence:
@@ -327,7 +289,7 @@ class RingReader(Generic[SampleT]):
             wanted = self.latest
             if wanted == 0:
                 return None
-            slot = wanted % len(self._slots)
+            slot = wanted % self.slot_count
             frame = self.frame_class(self, self._slots[slot], in_ring=self._slot_words[slot])
             if frame.sequence == wanted and frame.valid:
                 return frame

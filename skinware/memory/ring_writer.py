@@ -71,15 +71,13 @@ class RingWriter:
     def begin(
         self, *, from_last: bool = False, skip: int = 0, contents: memoryview | None = None
     ) -> dict[str, npt.NDArray[Any]]:
-        """Return the columns of the next slot, to be filled; they hold an old sample.
+        """Return the columns of the next slot, to be filled; they hold an old sample, or the newest or ``contents``.
 
         Until ``commit``, readers of that old sample find that it is gone.
 
         Args:
-            from_last: copy the newest sample into it first, for writers that change parts only.
             skip: sequences before its own that are left out; readers count them as missed. It is one more where the
                 slot would be that of the newest sample, which stays readable meanwhile.
-            contents: a whole slot of the same layout, to be copied into it first.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
@@ -94,25 +92,10 @@ class RingWriter:
         return self._columns[slot]
 
     def commit(self, acquired_ns: int, flags: int = 0) -> int:
-        """Publish what was filled in since ``begin`` and wake all readers with one system call.
+        """Publish what was filled in since ``begin``, as :meth:`skinware.service.Writer.commit` says.
 
         If it raises, nothing has changed: the newest sample is the one before; the one begun may still be committed.
         An exception from outside in the middle of it (Ctrl-C) leaves the sample published, or not at all.
-
-        Args:
-            acquired_ns: newest time stamp of the data, CLOCK_MONOTONIC ns. Below 0 (a device's stamp from before this
-                machine booted) it counts as 0, and in ``WriterStatistics.before_boot``. More than 0.2 s in the future
-                it stays as it is, is fresh for no reader, and counts in ``WriterStatistics.ahead``.
-            flags: bits for the service's own use.
-
-        Returns:
-            The sample's sequence.
-
-        Raises:
-            Closed: this writer was closed since ``begin``, or belongs to the process before a fork.
-            ServiceError: there was no ``begin`` before it: the slot holds an old sample.
-            TypeError: ``acquired_ns`` or ``flags`` is no integer.
-            ValueError: ``acquired_ns`` does not fit 63 bits, or ``flags`` 64.
         """
         if self.segment.descriptor.fd < 0:
             raise Closed(f"{self.segment.path}: this writer was closed, or belongs to the process before a fork")
@@ -127,7 +110,6 @@ class RingWriter:
         _wake(self._state_at)
 
     def count_missed_periods(self, count: int) -> None:
-        """Add to the number of periods that this writer missed, for everybody to see."""
         self._words[MISSED_PERIODS] += count
 
     def count_lateness(self, late_ns: int) -> None:

@@ -61,11 +61,7 @@ class Schema:
 
     @staticmethod
     def of(columns: Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]], description: str) -> Schema:
-        """Return a schema from what a person wrote.
-
-        Raises:
-            ConfigurationError: a dtype or shape that cannot be shared.
-        """
+        """Return a schema from what a person wrote; refuse dtypes and shapes that cannot be shared."""
         made: dict[str, Column] = {}
         for name, given in columns.items():
             column = given if isinstance(given, Column) else Column(np.dtype(given[0]), _shape(given[1]))
@@ -82,19 +78,16 @@ class Schema:
         return {name: (_table_dtype(c.dtype), math.prod(c.shape)) for name, c in self.columns.items()}
 
     def for_file(self, static: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
-        """Return the static column that says what the column table cannot; none if it can say everything.
-
-        Args:
-            static: the other static columns.
-        """
-        tables = {name: _descr(table.dtype) for name, table in static.items() if table.dtype.names is not None}
+        """Return the static column that says what the column table cannot, if that cannot say everything."""
+        descr = np.lib.format.dtype_to_descr
+        tables = {name: descr(table.dtype) for name, table in static.items() if table.dtype.names is not None}
         if not (self.description or tables) and all(
             c.dtype == _table_dtype(c.dtype) and len(c.shape) == 1 and not c.unit and not c.description
             for c in self.columns.values()
         ):
             return {}
         columns = {
-            name: {"dtype": _descr(c.dtype), "shape": c.shape, "unit": c.unit, "description": c.description}
+            name: {"dtype": descr(c.dtype), "shape": c.shape, "unit": c.unit, "description": c.description}
             for name, c in self.columns.items()
         }
         text = msgspec.json.encode({"description": self.description, "columns": columns, "tables": tables})
@@ -117,11 +110,7 @@ class _SchemaText(msgspec.Struct):
 
 
 def from_file(layout: FileLayout, static: Mapping[str, npt.NDArray[Any]], path: str) -> Schema:
-    """Return the schema of an attached file.
-
-    Raises:
-        BadServiceFile: its schema contradicts its column table, or cannot be read.
-    """
+    """Return the schema of an attached file, if it can be read and agrees with the column table."""
     columns = {c.name: Column(c.dtype, (c.count,)) for c in layout.slot}
     if STATIC_NAME not in static:
         return Schema(columns)
@@ -162,16 +151,12 @@ def _table_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
     return dtype if dtype.names is None and dtype.subdtype is None else np.dtype(f"V{dtype.itemsize}")
 
 
-def _descr(dtype: np.dtype[Any]) -> Any:
-    return np.lib.format.dtype_to_descr(dtype)
-
-
 def _tuples(descr: Any) -> Any:
     """Make tuples of the lists of JSON, as numpy needs them."""
-    if isinstance(descr, list):
-        return [(_name(f[0]), _tuples(f[1]), *(tuple(shape) for shape in f[2:])) for f in descr]
-    return descr
-
-
-def _name(name: Any) -> Any:
-    return tuple(name) if isinstance(name, list) else name  # with a title
+    if not isinstance(descr, list):
+        return descr
+    fields = []
+    for name, of, *shape in descr:
+        title_and_name = tuple(name) if isinstance(name, list) else name
+        fields.append((title_and_name, _tuples(of), *map(tuple, shape)))
+    return fields

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import mmap
 import os
 import secrets
@@ -104,14 +103,6 @@ class Segment:
         futex.Word(self.data, file_layout.WAKE_WORD_OFFSET).wake_all()
 
 
-def previous(namespace: Namespace, name: str) -> Segment | None:
-    """Return the generation that a dead writer left, None if none is left that anybody can be attached to."""
-    try:
-        return attach(namespace, name, writable=True)
-    except (ServiceNotFound, BadServiceFile):
-        return None
-
-
 def create(
     namespace: Namespace,
     name: str,
@@ -123,12 +114,7 @@ def create(
     period_ns: int,
     published_before: int,
 ) -> Segment:
-    """Make a new generation, which stays invisible until it is published. The caller owns the name.
-
-    Raises:
-        ConfigurationError: slots, columns or a kind that the format cannot hold.
-        NamespaceError: no room in shared memory, or no rights.
-    """
+    """Make a new generation, which stays invisible until it is published. The caller owns the name."""
     if STATIC_NAME in static:
         raise ConfigurationError(f"the table name {STATIC_NAME!r} is taken: give yours another name")
     if len(kind.encode()) > file_layout.KIND_BYTES:
@@ -173,23 +159,13 @@ def _write_head(
 
 
 def publish(segment: Segment, namespace: Namespace, name: str) -> None:
-    """Put a generation that was created in the place of the one before.
-
-    Raises:
-        NamespaceError: that is not possible; nothing has changed.
-    """
+    """Put a generation that was created in the place of the one before, or raise and change nothing."""
     final = namespace.ring_path(name)
     try:
         os.rename(segment.path, final)
     except OSError as error:
         raise NamespaceError(f"cannot make {final}: {error.strerror}") from None
     segment.path = str(final)
-
-
-def discard(segment: Segment) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(segment.path)
-    segment.close()
 
 
 def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
@@ -206,13 +182,7 @@ def _map(path: Path, size: int) -> npt.NDArray[np.uint8]:
 
 
 def attach(namespace: Namespace, name: str, *, writable: bool = False) -> Segment:
-    """Map the present generation of a service after checking everything that is mapped.
-
-    Raises:
-        ServiceNotFound: there is none.
-        BadServiceFile: the file is not one that can be read safely.
-        NamespaceError: the namespace cannot be trusted or read, or this program has no descriptors or memory left.
-    """
+    """Map the present generation of a service after checking everything that is mapped."""
     if not namespace.exists():
         raise ServiceNotFound(_not_found(namespace, name))
     owner = namespace.check()
@@ -256,14 +226,7 @@ def _cannot(path: Path, what: str, error: OSError) -> BadServiceFile | Namespace
 
 
 def recorded(head: bytes, name: str) -> Segment:
-    """Return a generation of which only the head is there (:attr:`Segment.head`): all but its slots and its writer.
-
-    Args:
-        head: its bytes.
-
-    Raises:
-        BadServiceFile: they are not a head that can be read safely.
-    """
+    """Return a generation of which only the head is there (:attr:`Segment.head`): all but its slots and its writer."""
     size = int(np.frombuffer(head, file_layout.HEADER, 1)["file_size"][0]) if len(head) >= _HEAD_LEAST else len(head)
     header, layout = file_layout.parse(head, name, size)
     if layout.slot_offset != len(head):
@@ -275,11 +238,7 @@ def recorded(head: bytes, name: str) -> Segment:
 
 
 def head_like(segment: Segment, schema: Schema, static: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """Return the head of the same generation with other columns and tables; of no file, as :func:`recorded` reads it.
-
-    Raises:
-        ConfigurationError: the format cannot hold them.
-    """
+    """Return the head of the same generation with other columns and tables, as :func:`recorded` reads it."""
     static = {**static, **schema.for_file(static)}
     layout = file_layout.plan(static, schema.for_layout(), segment.layout.slot_count)
     header = np.array([segment.header], file_layout.HEADER)
@@ -290,6 +249,19 @@ def head_like(segment: Segment, schema: Schema, static: Mapping[str, npt.NDArray
     changing = slice(file_layout.CONTROL_OFFSET, file_layout.COLUMN_OFFSET)
     data[changing] = segment.data[changing]
     _write_head(data, header, layout, static)
+    return data.tobytes()
+
+
+def head_of(name: str, schema: Schema, static: Mapping[str, npt.NDArray[Any]], *, kind: str, period_ns: int) -> bytes:
+    """Return the head of a generation that no writer made, as :func:`recorded` reads it.
+
+    Raises:
+        ConfigurationError: the format cannot hold these columns and tables.
+    """
+    static = {**static, **schema.for_file(static)}
+    layout = file_layout.plan(static, schema.for_layout(), None, period_ns)
+    data = np.zeros(layout.slot_offset, np.uint8)
+    _write_head(data, _header(name, layout, layout.digest(static), kind, period_ns, 0), layout, static)
     return data.tobytes()
 
 

@@ -17,12 +17,7 @@ def bucket_of(value_ns: int) -> int:
 
 
 class Spread(msgspec.Struct):
-    """How long something took.
-
-    Attributes:
-        count: how often it was timed.
-        best_ns, worst_ns: extremes; 0 as long as ``count`` is.
-    """
+    """How often something was timed, and how long it took; the extremes are 0 until it was."""
 
     count: int = 0
     best_ns: int = 0
@@ -44,11 +39,7 @@ class Spread(msgspec.Struct):
 
 
 class Histogram(msgspec.Struct):
-    """Times in buckets that double: bucket k counts 2**(k-1) to 2**k - 1 ns, the last one all above.
-
-    Attributes:
-        counts: one per bucket.
-    """
+    """Times in buckets that double: bucket k counts 2**(k-1) to 2**k - 1 ns, the last one all above."""
 
     counts: list[int] = msgspec.field(default_factory=lambda: [0] * BUCKETS)
 

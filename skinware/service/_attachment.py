@@ -26,16 +26,7 @@ _HASTE = 2
 
 
 class Attachment(Generic[SampleT]):
-    """Attached to one service by name; goes over to its next generation when the writer comes back.
-
-    Args:
-        timeout_s: how long to wait for it to appear; 0 for not at all, None for no limit.
-
-    Raises:
-        ServiceNotFound: it did not appear in time.
-        BadServiceFile: its file cannot be read safely.
-        NamespaceError: the namespace cannot be trusted or read.
-    """
+    """Attached to one service by name; goes over to its next generation when the writer comes back."""
 
     frame_class: type[Any] = Sample
 
@@ -45,7 +36,16 @@ class Attachment(Generic[SampleT]):
         self._client = RequestClient(self.namespace, name)
         self._closed = False
         self._moved = False
-        self._ring: RingReader[SampleT] = self._attach_within(timeout_s)
+        timer = Periodic(10)
+        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
+        while True:
+            try:
+                self._ring: RingReader[SampleT] = self._attach()
+                break
+            except ServiceNotFound:
+                if deadline_ns is not None and now_ns() >= deadline_ns:
+                    raise
+            timer.wait()
 
     @property
     def writer_statistics(self) -> WriterStatistics:
@@ -160,17 +160,6 @@ class Attachment(Generic[SampleT]):
     def _describe(self, _attached: segments.Segment) -> object:
         """Return the ``context`` of samples (a subclass reads its structure here); kept while the columns are equal."""
         return None
-
-    def _attach_within(self, timeout_s: float | None) -> RingReader[SampleT]:
-        timer = Periodic(10)
-        deadline_ns = None if timeout_s is None else now_ns() + round(timeout_s * NS_PER_S)
-        while True:
-            try:
-                return self._attach()
-            except ServiceNotFound:
-                if deadline_ns is not None and now_ns() >= deadline_ns:
-                    raise
-            timer.wait()
 
     def _adopt(self, ring: RingReader[SampleT]) -> None:
         self._ring.segment.close()

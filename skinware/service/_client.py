@@ -102,12 +102,6 @@ class RequestClient(ForkGuard):
         super().__init__()
 
     def send(self, operation: str, arguments: dict[str, Any]) -> PendingRequest:
-        """Ask for something.
-
-        Raises:
-            RequestRefused: the service takes no requests, or the arguments cannot be sent.
-            PeerGone: its writer is dead.
-        """
         number = next(self._numbers)
         try:
             packet = msgspec.json.encode(Ask(number, operation, msgspec.Raw(msgspec.json.encode(arguments))))
@@ -168,30 +162,27 @@ class RequestClient(ForkGuard):
     def close(self) -> None:
         self._lose()
 
-    def abandon(self) -> None:
-        """See :class:`skinware.memory.locks.ForkGuard`."""
-        self._lose()
+    abandon = close
 
     def _connect(self) -> socket.socket:
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_CLOEXEC)
         connection.setblocking(False)
-        try:
-            with short_path(self._namespace.socket_path(self.name)) as path:
-                connection.connect(path)
-        except FileNotFoundError:
-            connection.close()
-            raise RequestRefused(f"service {self.name!r} takes no requests") from None
-        except ConnectionRefusedError:
-            connection.close()
-            raise PeerGone(f"the writer of {self.name!r} is dead") from None
-        except BlockingIOError:
-            connection.close()
-            raise RequestTimeout(f"{self.name}: too many programs are waiting for its writer") from None
-        except PermissionError:
-            connection.close()
-            raise RequestRefused(
-                f"you may not send requests to {self.name!r}: only its owner and the namespace's group may"
-            ) from None
+        with contextlib.ExitStack() as on_error:
+            on_error.enter_context(connection)
+            try:
+                with short_path(self._namespace.socket_path(self.name)) as path:
+                    connection.connect(path)
+            except FileNotFoundError:
+                raise RequestRefused(f"service {self.name!r} takes no requests") from None
+            except ConnectionRefusedError:
+                raise PeerGone(f"the writer of {self.name!r} is dead") from None
+            except BlockingIOError:
+                raise RequestTimeout(f"{self.name}: too many programs are waiting for its writer") from None
+            except PermissionError:
+                raise RequestRefused(
+                    f"you may not send requests to {self.name!r}: only its owner and the namespace's group may"
+                ) from None
+            on_error.pop_all()
         self._connection = connection
         return connection
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import logging
 import os
@@ -11,7 +12,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from skinware.errors import Closed, NameInUse, NamespaceError
+from skinware.errors import BadServiceFile, Closed, NameInUse, NamespaceError, ServiceNotFound
 from skinware.memory import file_layout, name_lock, segments
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace, check_name
@@ -29,19 +30,7 @@ Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
 
 
 class Ownership:
-    """Holds a name from its construction to ``close``, and publishes one generation after the other under it.
-
-    Args:
-        schema, static, kind, slots, period_ns: of the first generation.
-        group: who may read.
-        operations: what programs may ask for.
-        published_before: samples that were published under the name before; None: the count in the files.
-
-    Raises:
-        NameInUse: a running writer has this name.
-        NamespaceError: the namespace cannot be used, or shared memory is full.
-        ConfigurationError: a bad name, slot count or column.
-    """
+    """Holds a name from its construction to ``close``, and publishes one generation after the other under it."""
 
     _ring: RingWriter
 
@@ -72,7 +61,10 @@ class Ownership:
         self._name_lock = name_lock.take_name(self.namespace, name)
         try:
             sweep(self.namespace)
-            previous = segments.previous(self.namespace, name)
+            try:
+                previous = segments.attach(self.namespace, name, writable=True)  # a dead writer left it
+            except (ServiceNotFound, BadServiceFile):
+                previous = None
             if published_before is None:
                 published_before = name_lock.published_so_far(self._name_lock, previous)
             self._begin_generation(schema, static, period_ns, previous, published_before)
@@ -219,7 +211,9 @@ class Ownership:
                 ring.set_state(file_layout.STATE_PAUSED, self._paused)
                 segments.publish(segment, self.namespace, self.name)
             except BaseException:
-                segments.discard(segment)
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(segment.path)
+                segment.close()
                 raise
             self._ring, self._static = ring, dict(static)
             self._next_file_check_ns = now_ns() + _FILE_CHECK_NS

@@ -288,49 +288,26 @@ class Tap(ServiceReader[SampleT]):
         return self._last
 
     def begin_in_order(self, *, with_first: bool) -> None:
-        """Read in order from now on.
-
-        Args:
-            with_first: begin with the first sample of the generation at hand, otherwise with the one that is its newest
-                now. Samples that are overwritten before they are taken are missed.
-        """
+        """Read in order from now on, from the first sample of the generation at hand, or else from its newest."""
         self._accounts.begin_loop("in order")
         self._last = (self._ring.generation, 0 if with_first else max(0, self._ring.latest - 1))
 
     def next_in_order(self) -> SampleT | None:
-        """Return the sample after the last one taken, over generations; None if it is not there yet. Never wait.
-
-        Raises:
-            StructureChanged, Overrun, Closed: as ``in_order``.
-        """
+        """Return the sample after the last one taken, over generations; None if it is not there yet. Never wait."""
         try:
             return self._read_in_order(0)
         except ServiceTimeout:
             return None
 
     def newest(self) -> SampleT:
-        """Return a copy of the newest sample of the generation at hand.
-
-        Raises:
-            ServiceTimeout: nothing was published yet.
-            Overrun: the writer is too fast for this number of slots.
-        """
+        """Return a copy of the newest sample of the generation at hand."""
         return self._newest_now(self._ring.copy, True)
 
     def newest_acquired_ns(self) -> int:
-        """``acquired_ns`` of the newest sample.
-
-        Raises:
-            Overrun: it was overwritten meanwhile, or nothing was published yet.
-        """
         return self._acquisitions()[-1][1]
 
     def nearest(self, time_ns: int) -> SampleT:
-        """Return a copy of the sample in the ring whose ``acquired_ns`` is nearest to a time.
-
-        Raises:
-            Overrun: it was overwritten meanwhile, or nothing was published yet.
-        """
+        """Return a copy of the sample in the ring whose ``acquired_ns`` is nearest to a time."""
         sequence, _ = min(self._acquisitions(), key=lambda frame: abs(frame[1] - time_ns))
         frame = self._ring.copy(sequence)
         if frame is None:

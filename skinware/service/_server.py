@@ -101,8 +101,6 @@ class RequestServer(ForkGuard):
     Packets of other users than the writer's are small: what one costs, it costs before anybody can look at a clock.
 
     Args:
-        namespace: where the service is.
-        name: of the service; the caller owns it.
         operations: descriptions of the operations that the service declares.
 
     Attributes:
@@ -126,6 +124,7 @@ class RequestServer(ForkGuard):
         self._peers: dict[int, _Peer] = {}
         self._epoll = select.epoll()
         self._hears_of_peers = True
+        self._bytes_left = 0  # of this turn
         self._listener = self._listen()
         super().__init__()
 
@@ -170,29 +169,25 @@ class RequestServer(ForkGuard):
         return -1 if self._epoll.closed else self._epoll.fileno()
 
     def take(self, timeout_s: float = 0.0, *, at_most: int | None = None) -> list[Request]:
-        """Return the requests that have arrived, as many as fit into one turn.
-
-        Args:
-            timeout_s: longest wait for one.
-            at_most: no more than these, though the turn is not over.
-        """
+        """Return the requests that have arrived, as many as fit into one turn; wait for the first."""
         found: list[Request] = []
         wait_until_ns = now_ns() + round(timeout_s * NS_PER_S)
-        turn = _Turn(self.turn_ns)
+        self._bytes_left, end_ns = _TURN_BYTES, 0
         while not self._epoll.closed and len(found) != at_most:
             wait_s = 0.0 if found else max(0, wait_until_ns - now_ns()) / NS_PER_S
             events = self._epoll.poll(wait_s, 1)  # one at a time: every peer is heard before any is heard again
             if not events:
                 break
-            turn.begin()
+            end_ns = end_ns or now_ns() + self.turn_ns
             fd = events[0][0]
             if fd == self._listener.fileno():
                 self._accept()
             elif fd in self._peers:
-                request = self._hear(self._peers[fd], turn)
+                request = self._hear(self._peers[fd])
                 if request is not None:
                     found.append(request)
-            if turn.is_over() and (found or now_ns() >= wait_until_ns):
+            time_ns = now_ns()
+            if (self._bytes_left <= 0 or time_ns >= end_ns) and (found or time_ns >= wait_until_ns):
                 break
         return [request for request in found if not request.cancelled]
 
@@ -258,13 +253,13 @@ class RequestServer(ForkGuard):
         self._drop(min(idle, key=lambda peer: peer.heard_ns))
         return ""
 
-    def _hear(self, peer: _Peer, turn: _Turn) -> Request | None:
+    def _hear(self, peer: _Peer) -> Request | None:
         try:
             packet = receive(peer.connection)
         except BlockingIOError:
             return None
         peer.heard_ns = now_ns()
-        turn.bytes_left -= len(packet)
+        self._bytes_left -= len(packet)
         ask = decode(packet, Ask)
         if ask is None:
             self._drop(peer)
@@ -307,22 +302,6 @@ class RequestServer(ForkGuard):
         peer.open.clear()
         self._epoll.unregister(fd)
         peer.connection.close()
-
-
-class _Turn:
-    """The rest of one turn: time and bytes."""
-
-    def __init__(self, turn_ns: int) -> None:
-        self.bytes_left = _TURN_BYTES
-        self._turn_ns = turn_ns
-        self._end_ns: int | None = None
-
-    def begin(self) -> None:
-        if self._end_ns is None:
-            self._end_ns = now_ns() + self._turn_ns
-
-    def is_over(self) -> bool:
-        return self.bytes_left <= 0 or (self._end_ns is not None and now_ns() >= self._end_ns)
 
 
 def _too_costly(arguments: msgspec.Raw) -> str:

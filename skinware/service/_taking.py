@@ -35,45 +35,14 @@ class Accounts:
         self._record = ReaderRecord(service, os.getpid(), program, "on demand")
         self._namespace, self._announce_it = namespace, announce
         self._announcement: Announcement | None = None
-        self._announced_ns = self._announced_frames = 0
+        self._announced_ns = self._announced_frames = self.due_ns = 0
         self._in_loop = False
         self._turns: list[Turn] = []
         self._cpu_ns = 0
 
     @property
     def record(self) -> ReaderRecord:
-        self._add_up()
-        return self._record
-
-    def begin_loop(self, kind: str) -> None:
-        """From now on the reader reads in a loop, whose turns are timed."""
-        self._record.kind = kind
-        self._in_loop = True
-
-    def taken(self, missed: int) -> None:
-        self._record.frames += 1
-        if missed:
-            self._record.missed += missed
-
-    @property
-    def due_ns(self) -> int:
-        return self._announced_ns + _ANNOUNCE_EVERY_NS
-
-    def settle(self, turns: Turns) -> None:
-        self._record.frames += turns.frames
-        self._record.missed += turns.missed
-        self._turns += turns.over if self._in_loop else [turn._replace(cpu_ns=0) for turn in turns.over]
-
-    def end_turn(self, turn: tuple[int, int] | None) -> None:
-        """Note the turn that ends now, if there is one; add up and announce now and then."""
-        time_ns = now_ns()
-        if turn is not None:
-            self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else 0))
-        if time_ns - self._announced_ns >= _ANNOUNCE_EVERY_NS:
-            self._add_up()
-            self._announce(time_ns)
-
-    def _add_up(self) -> None:
+        """The figures so far, all turns added up."""
         record = self._record
         turns, self._turns = self._turns, []
         for acquired_ns, taken_ns, ended_ns, cpu_ns in turns:
@@ -85,9 +54,31 @@ class Accounts:
                 if 0 < self._cpu_ns <= cpu_ns:
                     record.cpu.add(cpu_ns - self._cpu_ns)
                 self._cpu_ns = cpu_ns
+        return record
 
-    def _announce(self, time_ns: int) -> None:
-        record = self._record
+    def begin_loop(self, kind: str) -> None:
+        """From now on the reader reads in a loop, whose turns are timed."""
+        self._record.kind = kind
+        self._in_loop = True
+
+    def taken(self, missed: int) -> None:
+        self._record.frames += 1
+        if missed:
+            self._record.missed += missed
+
+    def settle(self, turns: Turns) -> None:
+        self._record.frames += turns.frames
+        self._record.missed += turns.missed
+        self._turns += turns.over if self._in_loop else [turn._replace(cpu_ns=0) for turn in turns.over]
+
+    def end_turn(self, turn: tuple[int, int] | None) -> None:
+        """Note the turn that ends now, if there is one; add up and announce now and then."""
+        time_ns = now_ns()
+        if turn is not None:
+            self._turns.append(Turn(*turn, time_ns, time.thread_time_ns() if self._in_loop else 0))
+        if time_ns < self.due_ns:
+            return
+        record = self.record
         if self._announced_ns:
             passed_ns = time_ns - self._announced_ns
             record.rate_hz = round((record.frames - self._announced_frames) * NS_PER_S / passed_ns, 2)
@@ -96,6 +87,7 @@ class Accounts:
                 self._announcement = Announcement(self._namespace, record.service)
             self._announcement.write(record)
         self._announced_ns, self._announced_frames = time_ns, record.frames
+        self.due_ns = time_ns + _ANNOUNCE_EVERY_NS
 
     def close(self) -> None:
         self._announce_it = False
@@ -104,11 +96,7 @@ class Accounts:
 
 
 class Taking(Attachment[SampleT]):
-    """Takes the samples of a service: the newest, or one after the other.
-
-    Args:
-        name, namespace, timeout_s: as for :class:`skinware.service._attachment.Attachment`, which lists the errors.
-    """
+    """Takes the samples of a service: the newest, or one after the other."""
 
     def __init__(self, name: str, namespace: Namespace | str | None, timeout_s: float | None, announce: bool) -> None:
         super().__init__(name, namespace, timeout_s)
@@ -257,14 +245,7 @@ class Taking(Attachment[SampleT]):
     def _take_turn(
         self, wanted: int, timeout_ns: int, max_age_s: float | None = None, newer_than: Position | None = None
     ) -> SampleT:
-        """Return the next sample after ``newer_than`` (default: the last one taken).
-
-        C takes it, as long as nothing but samples happens since the last one.
-
-        Args:
-            wanted: ``NEWER`` for the newest, or ``NEXT``.
-            max_age_s: as for ``read``.
-        """
+        """Return the sample after ``newer_than`` or the last one taken; C takes it while only samples come."""
         begun_ns = 0
         if self._turns_in_c and max_age_s is None and not self._closed:
             ring = self._ring
@@ -272,7 +253,7 @@ class Taking(Attachment[SampleT]):
                 frames = ring.take.next(wanted, timeout_ns)
                 if frames:
                     return frames[0]
-                begun_ns = ring.take.begun_ns
+                begun_ns = ring.take.state_in_c.begun_ns
         deadline_ns = (begun_ns or now_ns()) + timeout_ns
         if wanted == NEXT:
             frame = self._read_in_order(deadline_ns)

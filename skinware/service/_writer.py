@@ -151,7 +151,12 @@ class Writer(Ownership):
             if request.operation == ACQUIRE:
                 waiting.append(request)
             else:
-                self._carry_out(request)
+                try:
+                    result = self._operations[request.operation](**request.arguments)
+                except Exception as error:  # noqa: BLE001
+                    request.fail(f"{request.operation}: {error}")
+                else:
+                    request.reply(result, self.position)
             found = server.take(at_most=1) if now_ns() < end_ns else []
         if not self._paused:
             return waiting
@@ -200,14 +205,6 @@ class Writer(Ownership):
     def _refuse(self, waiting: list[Request]) -> None:
         for request in waiting:
             request.fail("the service is paused", "paused")
-
-    def _carry_out(self, request: Request) -> None:
-        try:
-            result = self._operations[request.operation](**request.arguments)
-        except Exception as error:  # noqa: BLE001
-            request.fail(f"{request.operation}: {error}")
-        else:
-            request.reply(result, self.position)
 
     def __enter__(self) -> Self:
         return self

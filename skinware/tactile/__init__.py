@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from skinware.tactile.contacts import Contact, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsReader
     from skinware.tactile.curves import read_curves
-    from skinware.tactile.health import Health, HealthKind, HealthReport, HealthSettings
+    from skinware.tactile.health import Health, HealthSettings
+    from skinware.tactile.health_report import HealthKind, HealthReport
     from skinware.tactile.health_service import HealthReader
     from skinware.tactile.motion import MotionSet, motion_of
     from skinware.tactile.motion_service import MotionReader

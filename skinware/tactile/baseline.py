@@ -29,7 +29,7 @@ import numpy.typing as npt
 from skinware import native
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.native.structs import give_arrays, read_structs
+from skinware.native import give_arrays, read_structs
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.rule import FORGET_AFTER_S, SIGNED_TYPES, UNUSABLE, BaselineSettings, resolution_of

@@ -218,7 +218,7 @@ class Copies:
 
 
 class _Alone:
-    """What a taxel that seemed to be touched alone shows of each of some others of its module."""
+    """Compares a taxel that seemed to be touched alone with some others of its module."""
 
     def __init__(self, others: Whole) -> None:
         self._others = others

@@ -102,11 +102,7 @@ class FrameEncoder:
 
 
 def encoded(frame: Sample, before: Sample | None, columns: Sequence[CodedColumn]) -> bytes:
-    """Return the message of a frame.
-
-    Args:
-        before: the frame whose difference to it is coded; None: it becomes a key frame.
-    """
+    """Return the message of a frame, coded as its difference to the frame before, or as a key frame."""
     slot, slot_before = frame.slot, None if before is None else before.slot
     after = 0 if before is None else before.sequence
     header = _HEADER.pack(frame.generation, frame.sequence, frame.acquired_ns, frame.published_ns, frame.flags, after)

@@ -165,7 +165,12 @@ class Collector:
             except Overrun:
                 return  # it counts as missed before the next frame
             except StructureChanged:
-                if not self._reattach(name, source):
+                try:
+                    reader.reattach()
+                except ServiceNotFound:
+                    return
+                except (BadServiceFile, NamespaceError) as error:
+                    self._report_trouble(name, str(error))
                     return
                 continue
             if frame is None:
@@ -175,16 +180,6 @@ class Collector:
             is_first = frame.generation != before
             head = reader.head if is_first else None
             yield _Taken(name, frame, head, is_first and before != 0, reader.missed - missed_before)
-
-    def _reattach(self, name: str, source: _Source) -> bool:
-        try:
-            source.reader.reattach()
-        except ServiceNotFound:
-            return False
-        except (BadServiceFile, NamespaceError) as error:
-            self._report_trouble(name, str(error))
-            return False
-        return True
 
     def _discover(self) -> None:
         if self._wish is not None:

@@ -94,11 +94,7 @@ class Generation:
         return self._segment.static_columns()
 
     def only(self, positions: Index) -> Generation:
-        """Return the same generation of a driver with some of its sensors.
-
-        Raises:
-            StructureError: there are none, or it is not a driver.
-        """
+        """Return the same generation of a driver with some of its sensors; refuse other services."""
         if self.structure is None:
             raise StructureError(f"service {self.name!r} is not a driver: it has no sensors")
         structure = self.structure.only(positions)
@@ -114,15 +110,7 @@ class Generation:
 
 
 def disguised(head: bytes, name: str, disguise: Callable[[str], str]) -> bytes:
-    """Return the head of a driver's generation with other names of its buses; that of another service as it is.
-
-    Args:
-        head: the bytes of the service's file up to its slots.
-        disguise: returns the other name of a bus.
-
-    Raises:
-        BadRecording: the head cannot be read.
-    """
+    """Return the head of a driver's generation with other names of its buses; that of another service as it is."""
     generation = Generation(head, name)
     structure = generation.structure
     if structure is None:

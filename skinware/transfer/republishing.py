@@ -87,16 +87,7 @@ class Republisher:
         return self._operations
 
     def publish(self, name: str, frame: RecordedSample, generation: Generation, *, follows: bool = True) -> None:
-        """Publish a frame now.
-
-        Args:
-            follows: it comes after the frame before, so that another generation means a restart; otherwise only other
-                columns or tables begin a new generation.
-
-        Raises:
-            NameInUse: a running driver or service has the name.
-            NamespaceError: the namespace cannot be used, or shared memory is full.
-        """
+        """Publish a frame now; unless it ``follows`` the one before, another generation is no restart."""
         if name in self._surplus:
             self._surplus.remove(name)
         count = generation.published_before + frame.sequence
@@ -165,11 +156,7 @@ class Republisher:
                 self._epoll.unregister(fd)
 
     def answer(self, timeout_s: float) -> None:
-        """Carry out requests.
-
-        Args:
-            timeout_s: longest wait for a request, in full milliseconds.
-        """
+        """Carry out requests; wait for the first so long, in full milliseconds."""
         for fd, _ in self._epoll.poll(timeout_s):
             call = self._calls.get(fd)
             if call is not None:

@@ -41,7 +41,14 @@ _SHARED = ("socketcan", "udp_multicast", "virtual")
 )
 @click.argument("name", required=False)
 @click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
-@cli.timeout_option("Fail after SECONDS without a frame; also wait for the driver.")
+@click.option(
+    "-T",
+    "--timeout",
+    "timeout_s",
+    metavar="SECONDS",
+    type=cli.seconds,
+    help="Fail after SECONDS without a frame; also wait for the driver.",
+)
 @cli.type_option("Only the sensors of one type, such as pressure.")
 @click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
 @click.option("--counts", is_flag=True, help="Raw counts, as the hardware sends them, instead of physical values.")

@@ -26,8 +26,7 @@ _HEADINGS = {
 }
 
 
-@click.group("skin-import", context_settings=cli.CONTEXT_SETTINGS)
-@cli.version_option
+@cli.group("skin-import")
 def command() -> None:
     """Create configurations for skin-driver from the files of other systems."""
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.native.structs import read_structs
+from skinware.native import read_structs
 from skinware_drivers.wire_tap import Kept
 
 _HEADERS = ("path.h", "inside.h", "framing.h", "flow.h")

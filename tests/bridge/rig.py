@@ -148,4 +148,4 @@ def _desert(joiner: Joiner) -> None:
     mirror._services.clear()
     mirror._deserted.clear()
     if joiner._state_writer is not None:
-        joiner._state_writer._service.desert()
+        joiner._state_writer.desert()

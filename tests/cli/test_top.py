@@ -83,7 +83,7 @@ def test_a_namespace_that_cannot_be_read_fails(namespace: Namespace, capsys: pyt
 def test_without_the_extra_a_person_is_told_and_gets_plain_lines(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(top, "_on_terminal", lambda: True)
+    monkeypatch.setattr(top, "are_terminals", lambda *_: True)
     monkeypatch.setattr(top, "find_spec", lambda _: None)
     with FakeSkin("a"):
         assert exit_status(command, ["-T", "0.01"]) == 0

@@ -25,8 +25,7 @@ from skinware.cli._painting import (
     Palette,
 )
 from skinware.cli._picture import CHANGE, RANGE
-from skinware.cli._top_app import SkinTop
-from skinware.cli._top_help import KEYS, Help
+from skinware.cli._top_app import KEYS, Help, SkinTop
 from skinware.cli._top_list import DriverList, room_for
 from skinware.cli._top_rows import COLUMNS
 from skinware.realtime import now_ns

@@ -127,7 +127,7 @@ def fork_and_die() -> None:
         self.close()
 
     writer = ServiceWriter("x", COLUMNS)
-    Descriptor.abandon = abandon_slowly  # type: ignore[method-assign]
+    Descriptor.abandon = abandon_slowly
     if os.fork() == 0:
         os._exit(0)
     assert not writer.closed

@@ -24,7 +24,7 @@ from skinware.memory.ring import (
     SampleT,
     slot_headers_of,
 )
-from skinware.memory.ring_reader import RingReader
+from skinware.memory.ring_reader import RingReader, TakeState
 from skinware.memory.ring_writer import RingWriter
 from skinware.memory.segments import Segment
 from skinware.memory.statistics import bucket_of
@@ -40,13 +40,11 @@ _TIMED, _WALL, _CPU, _BEFORE_BOOT, _AGE = 0, 1, 4, 7, 8
 class NothingInC:
     """In the place of C: each turn is Python's."""
 
-    begun_ns = 0
+    def __init__(self) -> None:
+        self.state_in_c = TakeState()
 
     def next(self, wanted: int, timeout_ns: int) -> None:
-        self.begun_ns = now_ns()
-
-    def leave_until(self, until_ns: int) -> None:
-        pass
+        self.state_in_c.begun_ns = now_ns()
 
 
 class SpecifiedReader(RingReader[SampleT]):

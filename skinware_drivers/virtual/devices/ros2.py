@@ -11,11 +11,9 @@ import zlib
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _ROWS, _COLUMNS = 4, 6
 _N = _ROWS * _COLUMNS
@@ -41,14 +39,11 @@ class EmulatedRos2(SerialEmulator[EmulatedRos2Options]):
     streams = "always"
     numbered_by = "topics"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(_N, _COLUMNS)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         return f"topic{int.from_bytes(payload[6:8], 'little') // _TOPICS_APART}" if len(payload) > 6 else ""
-
-    def kinds(self) -> Sequence[str]:
-        return [f"topic{number}" for number in self.numbers]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         message = self.options.message

@@ -1,8 +1,7 @@
 """Directives for tables that the code already has: ``settings``, ``members``, ``columns`` and ``catalogue``.
 
 ``settings CLASS`` shows the fields of a class with their defaults, ``members ENUM`` the members of an enumeration,
-``columns SOURCE`` the columns of a service, from the source of its values, ``catalogue NAME`` the sensor types of a
-dictionary.
+``columns KIND`` the columns of a kind of service, from its form, ``catalogue NAME`` the sensor types of a dictionary.
 """
 
 from __future__ import annotations
@@ -21,17 +20,13 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from skinware.service import Column
-from skinware.tactile.contacts_service import ContactsSource
-from skinware.tactile.health_service import HealthSource
-from skinware.tactile.motion_service import MotionSource
+from skinware.tactile.contacts_service import ContactsReader
+from skinware.tactile.health_service import HealthReader
+from skinware.tactile.motion_service import MotionReader
+from skinware.tactile.source_service import Source
 
-_NONE = np.zeros(1, np.uint64)
-_VALUES = {"driver": "", "type_name": "", "unit": "that of the values", "frames": ()}
-SOURCES = {
-    "contacts": ContactsSource(**_VALUES, uid=_NONE),
-    "motion": MotionSource(**_VALUES, regions=("",)),
-    "health": HealthSource("", _NONE, _NONE.astype(np.uint32)),
-}
+FORMS = {reader.form.kind: reader.form for reader in (ContactsReader, MotionReader, HealthReader)}
+_SOURCE = Source("", unit="that of the values", regions=("",), uid=np.zeros(1, np.uint64))
 
 
 def settings(name: str) -> Iterator[str]:
@@ -54,7 +49,7 @@ def members(name: str) -> Iterator[str]:
 def columns(service: str) -> Iterator[str]:
     """Yield the lines of a table of a service's columns."""
     yield from ("| column | dtype and shape | unit | meaning |", "|---|---|---|---|")
-    for name, column in SOURCES[service].columns().items():
+    for name, column in FORMS[service].columns(_SOURCE)[0].items():
         yield f"| `{name}` | {_form(column)} | {column.unit} | {column.description} |"
 
 

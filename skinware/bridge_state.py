@@ -132,7 +132,20 @@ class BridgeSample(Sample):
     def state(self) -> BridgeState:
         error_ns = int(self.column("clock_error_ns"))
         is_known = error_ns >= 0
-        rows = self.column("services")[: int(self.column("count"))]
+        services = {}
+        for row in self.column("services")[: int(self.column("count"))]:
+            state, mode = int(row["state"]), int(row["mode"])
+            p50_ns, p99_ns = (None if np.isnan(row[age]) else float(row[age]) for age in ("age_p50_ns", "age_p99_ns"))
+            services[row["name"].decode(errors="replace")] = ServiceState(
+                STATES[state] if state < len(STATES) else STATES[0],
+                MODES[mode] if mode < len(MODES) else MODES[0],
+                float(row["rate_hz"]),
+                int(row["gap"]),
+                float(row["bytes_per_s"]),
+                p50_ns,
+                p99_ns,
+                float(row["gap_hz"]),
+            )
         return BridgeState(
             str(self.context),
             bool(self.column("is_up")),
@@ -140,7 +153,7 @@ class BridgeSample(Sample):
             int(self.column("clock_offset_ns")) if is_known else None,
             error_ns if is_known else None,
             int(self.column("round_trip_ns")),
-            {row["name"].decode(errors="replace"): _state_of(row) for row in rows},
+            services,
             instance=_text(self.column("instance")),
             host=_text(self.column("host")),
             namesakes=int(self.column("namesakes")),
@@ -213,21 +226,6 @@ class BridgeStateWriter(ServiceWriter):
         self.commit(at_ns)
 
 
-def _state_of(row: npt.NDArray[Any]) -> ServiceState:
-    p50_ns, p99_ns = (None if np.isnan(row[name]) else float(row[name]) for name in ("age_p50_ns", "age_p99_ns"))
-    state, mode = int(row["state"]), int(row["mode"])
-    return ServiceState(
-        STATES[state] if state < len(STATES) else STATES[0],
-        MODES[mode] if mode < len(MODES) else MODES[0],
-        float(row["rate_hz"]),
-        int(row["gap"]),
-        float(row["bytes_per_s"]),
-        p50_ns,
-        p99_ns,
-        float(row["gap_hz"]),
-    )
-
-
 def _text(column: npt.NDArray[Any]) -> str:
     return bytes(column.item()).decode(errors="replace")
 
@@ -243,6 +241,18 @@ def as_data(bridge: BridgeState) -> dict[str, Any]:
             "error_ms": bridge.clock_error_ns / 1e6,
             "round_trip_ms": bridge.round_trip_ns / 1e6,
         }
+    services = {}
+    for name, service in bridge.services.items():
+        ages_ns = {"p50": service.age_p50_ns, "p99": service.age_p99_ns}
+        services[name] = {
+            "state": service.state,
+            "mode": service.mode,
+            "rate_hz": service.rate_hz,
+            "gap": service.gap,
+            "gap_hz": service.gap_hz,
+            "bytes_per_s": round(service.bytes_per_s),
+            "age_ms": {share: None if age_ns is None else age_ns / 1e6 for share, age_ns in ages_ns.items()},
+        }
     return {
         "connected": bridge.is_up,
         "since_s": round(max(0, now_ns() - bridge.since_ns) / NS_PER_S, 3),
@@ -253,7 +263,7 @@ def as_data(bridge: BridgeState) -> dict[str, Any]:
         "switches": bridge.switches,
         "refused": bridge.refused,
         "last_refused": bridge.last_refused or None,
-        "services": {name: _service_data(service) for name, service in bridge.services.items()},
+        "services": services,
     }
 
 
@@ -294,19 +304,3 @@ def as_lines(robot: str, state: dict[str, Any]) -> list[str]:
         for name, service in state["services"].items()
     ]
     return [summary(robot, state), *trouble(state), *(["", *table(_TITLES, rows, left=3)] if rows else [])]
-
-
-def _service_data(service: ServiceState) -> dict[str, Any]:
-    p50_ns, p99_ns = service.age_p50_ns, service.age_p99_ns
-    return {
-        "state": service.state,
-        "mode": service.mode,
-        "rate_hz": service.rate_hz,
-        "gap": service.gap,
-        "gap_hz": service.gap_hz,
-        "bytes_per_s": round(service.bytes_per_s),
-        "age_ms": {
-            "p50": None if p50_ns is None else p50_ns / 1e6,
-            "p99": None if p99_ns is None else p99_ns / 1e6,
-        },
-    }

@@ -139,6 +139,20 @@ class DriverReader(ServiceReader[DriverSnapshot]):
         return structure_of(attached)
 
 
+def recorded_head(name: str, structure: Structure, *, driver_type: str, period_ns: int) -> bytes:
+    """Return the head of a driver's generation that no driver made, with the columns that every driver has.
+
+    Args:
+        period_ns: nominal time between two snapshots; 0: none.
+
+    Raises:
+        ConfigurationError: the format cannot hold the structure.
+    """
+    columns = {column: of for column, of in _frame_columns(structure, 0, 0).items() if column in _REQUIRED}
+    static = {**structure.to_columns(), "driver_type": np.array([driver_type.encode()], "S32")}
+    return segments.head_of(name, Schema.of(columns, ""), static, kind=KIND, period_ns=period_ns)
+
+
 def counters_of(
     frame: DriverSnapshot, tables: Mapping[str, npt.NDArray[Any]], what: str, count: int
 ) -> tuple[list[str], npt.NDArray[np.uint64]]:

@@ -122,8 +122,6 @@ class Structure:
         )
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         self.geometry: Geometry | None = geometry
-        self._age_limits_ns: dict[int, npt.NDArray[np.int64]] = {}
-        self._matrices: dict[str, Matrices[str]] = {}
         self._check()
 
     def replace(self, **changes: Any) -> Structure:
@@ -201,6 +199,14 @@ class Structure:
     def group_age_limits_ns(self, period_ns: int) -> npt.NDArray[np.int64]:
         """Return (n_groups,) int64: the same for each update group."""
         return np.array([age_limit_ns(own or period_ns) for own in self.group_period_ns.tolist()], np.int64)
+
+    @cached_property
+    def _age_limits_ns(self) -> dict[int, npt.NDArray[np.int64]]:
+        return {}
+
+    @cached_property
+    def _matrices(self) -> dict[str, Matrices[str]]:
+        return {}
 
     @cached_property
     def _index_by_type(self) -> dict[str, Index]:

@@ -12,6 +12,7 @@ A driver puts pieces together while they happen, in Python and in C, and publish
 
 from __future__ import annotations
 
+import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,6 +54,32 @@ COLUMNS: dict[str, Any] = {
 """Columns of such a service. ``used``: bytes of the pieces; ``missed``: frames or bytes of the bus for which there was
 no room so far. Static columns: ``driver``, its name, ``bus_name``, the names of its buses, and ``about``, JSON: the
 driver and its options (``driver_type``, ``listen_only``, ``versions``; ``buses`` with ``medium`` and ``options``)."""
+
+
+SOCKETCAN, SERIAL = 227, 147
+"""Link types of interfaces in pcapng: LINKTYPE_CAN_SOCKETCAN, and LINKTYPE_USER0 with :data:`SERIAL_HEADER`."""
+SERIAL_HEADER = struct.Struct("<BBH")
+"""In front of the bytes of a packet of a serial line: version (1), 0 received or 1 sent, 0."""
+
+
+class WireItem(NamedTuple):
+    """A frame of a CAN bus, or bytes of a serial line that were read or written together.
+
+    Attributes:
+        time_ns: CLOCK_MONOTONIC.
+        epoch_ns: the same, ns since 1970.
+        is_sent: the driver sent it; False: it received it.
+        identifier: with the flags of linux/can.h; None for bytes.
+        flags: of :data:`ROWS`.
+        data: payload, or bytes.
+    """
+
+    time_ns: int
+    epoch_ns: int
+    is_sent: bool
+    identifier: int | None
+    flags: int
+    data: bytes
 
 
 class Piece(NamedTuple):

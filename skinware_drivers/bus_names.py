@@ -10,6 +10,7 @@ from skinware.errors import ConfigurationError
 
 _PLACING: dict[str, dict[str, str]] = {
     "replay": {"bus": "", "driver": ""},
+    "file": {"bus": "", "driver": ""},
     "serial": {"serial_number": "", "vid_pid": ""},
     "udp_multicast": {"port": "43113"},
     "socketcand": {"host": "", "port": ""},
@@ -45,7 +46,14 @@ class BusName(NamedTuple):
     def of(cls, text: str) -> BusName:
         """Return the parts of any text, also of one that names no bus; :func:`parse_bus_name` refuses mistakes."""
         address, _, query = text.partition("?")
-        return cls(*_split(address), dict(parse_qsl(query, keep_blank_values=True)))
+        interface, colon, channel = address.partition(":")
+        if interface in NETWORKS and channel.startswith("//"):
+            channel = channel[2:]
+        elif "/" in interface or channel.startswith("//"):  # a path, or a URL of pyserial
+            interface, channel = "serial", address
+        elif not colon:
+            interface, channel = (address, "") if address in ("virtual", "pty", "serial") else ("socketcan", address)
+        return cls(interface, channel, dict(parse_qsl(query, keep_blank_values=True)))
 
     @property
     def is_only_asked(self) -> bool:
@@ -94,14 +102,3 @@ def parse_bus_name(text: str) -> BusName:
                 f" modbus:./{channel or 'port'}"
             )
     return name
-
-
-def _split(address: str) -> tuple[str, str]:
-    interface, colon, channel = address.partition(":")
-    if interface in NETWORKS and channel.startswith("//"):
-        return interface, channel[2:]
-    if "/" in interface or channel.startswith("//"):  # a path, or a URL of pyserial
-        return "serial", address
-    if colon:
-        return interface, channel
-    return (address, "") if address in ("virtual", "pty", "serial") else ("socketcan", address)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import runpy
 import shlex
@@ -14,10 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 import pytest
 
 import skinware
 from skinware import realtime, threads
+from skinware.conversion.foreign import open_source
+from skinware.conversion.foreign.mapping import read_map as read_columns
 from skinware.tactile.chain import ChainSettings
 from skinware.tactile.curves import read_curves
 from skinware.tactile.regions import read_regions
@@ -25,6 +29,7 @@ from skinware.tactile.testing import read_stage
 from skinware.views.robot import read_robot
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
+from skinware_drivers.streams.ros2_map import read_map
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.commands import COMMANDS, PATIENCE_S, parse, refused, running
 
@@ -161,6 +166,16 @@ def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
         elif found.get("format") == "skinware-regions":
             file.write_text(text)
             read_regions(file)
+        elif found.get("format") == "skinware-columns":
+            file.write_text(text)
+            tips = {f"f1_{row}_{column}": np.zeros(5) for row in range(3) for column in range(4)}
+            arrays = {"time_s": np.arange(5.0), "forces": np.zeros((5, 4, 3)), "places": np.zeros((4, 3)), **tips}
+            np.savez(tmp_path / "data.npz", **arrays)  # type: ignore[arg-type]
+            with contextlib.closing(open_source(tmp_path / "data.npz")) as source:
+                read_columns(file, source)
+        elif found.get("format") == "skinware-ros2-map":
+            file.write_text(text)
+            read_map(str(file))
         elif found.get("format") == "skinware-links":
             file.write_text(text)
             for link in found["link"]:

@@ -1,27 +1,37 @@
-"""Gather presses or strokes for skin-calibrate, and show the coverage and the faults of a geometry."""
+"""Gather presses or strokes for skin-calibrate; read its layouts, write its places, and show what it found."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import numpy.typing as npt
 
 from skinware.cli import _command as cli
 from skinware.cli._heat_map import BACKGROUND, arrange
-from skinware.cli._terminal import are_terminals, echo, print_json, terminal_width
+from skinware.cli._terminal import are_terminals, echo, print_json, say, terminal_width
 from skinware.driver_service import DriverReader
+from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry, geometry_to_toml, read_geometry
+from skinware.memory.namespace import Namespace
+from skinware.service import ServiceReader
 from skinware.structure import Structure
 from skinware.tactile.calibration.checking import MIRRORED, OFF, SHARED, SWAPPED, TURNED, UNKNOWN, Finding
+from skinware.tactile.calibration.placing import Placement
+from skinware.tactile.calibration.results import placed_comment, placed_groups
+from skinware.tactile.calibration.shapes import Shape, shapes_of
 from skinware.tactile.calibration.sources import ForceSource, LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
 from skinware.text import plural
-from skinware.views.live import after, enter_pressed, frames_until
+from skinware.views.live import after, enter_pressed, frames_until, reader_of
 
 SIGNS = "·▂▃▄▅▆▇█"
 """Signs of sensors from nothing to all that is wanted."""
@@ -90,9 +100,24 @@ def _sensors(finding: Finding, structure: Structure, type_name: str) -> npt.NDAr
     return sensors
 
 
+_POSES_TIMEOUT_S = 5.0
 _REPORT_EVERY_S = 1.0
 _SAVE_EVERY_S = 10.0
 _WIDTH = 100
+
+
+@dataclass(frozen=True)
+class GatheringOptions:
+    """The options of all commands that gather."""
+
+    driver: str | None
+    type_name: str | None
+    share: float
+    duration_s: float | None
+    state: Path | None
+    fresh: bool
+    namespace: str | None
+    as_json: bool
 
 
 class Gathering:
@@ -226,3 +251,62 @@ class Gathering:
             self._reported = mean
             gathered = ", ".join(f"{count} {name}" for name, count in self._session.figures.items())
             echo(f"{gathered}: {figures['covered']} of {figures['sensors']} sensors have enough")
+
+
+@contextmanager
+def opened(
+    file: Path,
+    session_of: Callable[[int], Any],
+    how: GatheringOptions,
+    poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
+) -> Iterator[tuple[Gathering, Any]]:
+    """Yield a gathering, with driver and poses open, and its session."""
+    with ExitStack() as stack:
+        reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))
+        source = LoadSource(reader.structure, reader.driver_type, how.type_name)
+        pose_source = None
+        if poses is not None:
+            service, poses_namespace, column, shape = poses
+            place = Namespace(poses_namespace or how.namespace)
+            pose_reader = stack.enter_context(ServiceReader(service, namespace=place, timeout_s=_POSES_TIMEOUT_S))
+            pose_source = PoseSource(pose_reader, column, shape)
+        state_path = how.state or file.with_name(f"{file.name}.state.npz")
+        session = session_of(len(reader.structure.module_of(source.type_name)))
+        gathering = Gathering(reader, session, source, pose_source, state_path, fresh=how.fresh, as_json=how.as_json)
+        yield gathering, session
+
+
+def places_in_frame(places: Geometry, frame: str) -> tuple[npt.NDArray[np.float64], bool]:
+    """Places in the coordinate frame ``frame``, or else in the one with the most places; whether it is that frame."""
+    frames = Counter(places.frame[places.known].tolist())
+    here = frame if frame in frames else max(frames, key=lambda name: frames[name])
+    return np.where((places.frame == here)[:, None], places.position_m, np.nan), here == frame
+
+
+def read_layout(structure: Structure, type_name: str, layout: Path) -> tuple[Geometry, Mapping[int, Shape]]:
+    """Return the places of sensors in a file, and the shapes of the modules that have places there."""
+    places = read_geometry(layout).of(structure, type_name)
+    kinds = [bytes(kind).decode() for kind in structure.module_kind.tolist()]
+    shapes = shapes_of(structure.module_of(type_name), kinds, places.position_m, places.normal)
+    if not shapes:
+        raise ConfigurationError(f"{layout}: no whole module of this driver has places in it")
+    return places, shapes
+
+
+def write_places(file: Path, gathering: Gathering, placement: Placement, frame: str, pitch_m: float) -> None:
+    structure, type_name = gathering.structure, gathering.type_name
+    if not placement.known.any():
+        raise click.ClickException("no sensor was pressed often enough; nothing is written")
+    groups = placed_groups(structure, type_name, placement, frame, pitch_m)
+    file.write_text(geometry_to_toml(groups, placed_comment(structure, type_name, placement)), encoding="utf-8")
+
+
+def report_placed(as_json: bool, file: Path, placement: Placement, also: Mapping[str, Any], words: str) -> None:
+    known, wrong = int(placement.known.sum()), int(placement.wrong.sum())
+    tool, residual_mm = placement.tool, 1e3 * placement.spread_m
+    figures = {"placed": known, "wrong": wrong, "residual_m": round(placement.spread_m, 6)}
+    of_tool = {"corrected": tool.found, "doubts": tool.doubts, "unchecked_m": tool.unchecked}
+    text = f"{file}: {known} sensors placed, {wrong} presses left out, residual {residual_mm:.1f} mm{words}"
+    text = "\n".join([text, *tool.words()])
+    say(as_json, {"event": "done", "file": str(file), **figures, **of_tool, **also}, text)
+    click.get_current_context().exit(cli.EXIT_FAILED if tool.doubts else cli.EXIT_DONE)

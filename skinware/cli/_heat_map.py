@@ -145,9 +145,6 @@ def arrange(
         patches: to draw; several are drawn below each other with their names.
         smallest: pixels along the side of the smallest sensor: 1, or 2 where each needs a whole character.
         only: (n_sensors,) bool, sensors of a region; other sensors are left out, and modules without any of these.
-
-    Raises:
-        StructureError: there is no such type.
     """
     wanted = np.zeros(structure.n_sensors, bool)
     wanted[structure.index(type_name)] = True

@@ -37,9 +37,6 @@ def change_levels(
     """Return the levels of changes, and the changes at the lowest, the middle and the highest level.
 
     Levels grow with the square root, so that the lightest touch differs from none, and a light one from a hard one.
-
-    Args:
-        change: (n,) physical, 0 or more.
     """
     felt = np.sqrt(np.maximum(change - np.float32(noise), 0))
     return levels_of(felt, 0.0, math.sqrt(max(span - noise, 1e-30)), before), (0.0, span / 4, span)
@@ -47,12 +44,6 @@ def change_levels(
 
 class Picture:
     """The sensors of one type in one row of the list, drawn into a given space.
-
-    Args:
-        type_name: the type to draw where there is one of this name; otherwise each driver's first; see ``types_of``.
-        scale_name: the first meaning of the colours, one of ``SCALES``.
-        regions: that a person may choose from; None: there are none.
-        region: draw only sensors in this one at first; None: all.
 
     Attributes:
         scale_name: the meaning of the colours: ``change`` from rest, the type's ``range``, ``raw`` counts.

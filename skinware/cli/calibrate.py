@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,20 +10,10 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import say
-from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
+    pass
 
-    from skinware.cli._gathering import Gathering
-    from skinware.geometry import Geometry
-    from skinware.structure import Structure
-    from skinware.tactile.calibration.placing import Placement
-    from skinware.tactile.calibration.shapes import Shape
-
-_POSES_TIMEOUT_S = 5.0
-_MM = 1e3
 _STROKE = "stroke the whole skin with one finger"
 _PUSH = "press the skin through the reference, with forces that rise, rest and fall"
 _PRESS = "press the skin at known places; hold each for a moment"
@@ -67,20 +54,6 @@ _pressing = cli.options(
 )
 
 
-@dataclass(frozen=True)
-class _How:
-    """The options of all commands that gather."""
-
-    driver: str | None
-    type_name: str | None
-    share: float
-    duration_s: float | None
-    state: Path | None
-    fresh: bool
-    namespace: str | None
-    as_json: bool
-
-
 @cli.group("skin-calibrate")
 def command() -> None:
     """Find the places of sensors by touching the skin; check a geometry.
@@ -107,14 +80,15 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
     """
     import numpy as np
 
+    from skinware.cli._gathering import GatheringOptions, opened
     from skinware.geometry import geometry_to_toml
     from skinware.tactile.calibration.results import unrolled_comment, unrolled_groups
     from skinware.tactile.calibration.state import StrokeSession
     from skinware.tactile.calibration.topology import topology_of
     from skinware.text import plural
 
-    how = _How(**options)
-    with _opened(file, StrokeSession, how) as (gathering, session):
+    how = GatheringOptions(**options)
+    with opened(file, StrokeSession, how) as (gathering, session):
         gathering.run(_STROKE, how.share, how.duration_s)
         found = topology_of(session.sums, pitch_m)
         groups = unrolled_groups(gathering.structure, gathering.type_name, found)
@@ -167,23 +141,31 @@ def touch(
 
     Exit status: 0 the places can be trusted, 1 they are written, and cannot.
     """
+    from skinware.cli._gathering import (
+        GatheringOptions,
+        opened,
+        places_in_frame,
+        read_layout,
+        report_placed,
+        write_places,
+    )
     from skinware.tactile.calibration.placing import place
     from skinware.tactile.calibration.state import PressSession
 
-    how = _How(**options)
+    how = GatheringOptions(**options)
     if offset_m and layout is None:
         raise click.UsageError("--offset needs --layout, which has the normals")
     session_of = partial(PressSession, wanted=touches)
     where = (service, poses_namespace, column, (3,))
-    with _opened(file, session_of, how, where) as (gathering, session):
+    with opened(file, session_of, how, where) as (gathering, session):
         structure, type_name, shapes, layout_m, is_here = gathering.structure, gathering.type_name, None, None, False
         if layout is not None:
-            places, shapes = _layout(structure, type_name, layout)
-            layout_m, is_here = _layout_m(places, frame or service)
+            places, shapes = read_layout(structure, type_name, layout)
+            layout_m, is_here = places_in_frame(places, frame or service)
         gathering.run(_PRESS, how.share, how.duration_s)
         placement = place(session.presses, shapes, offset_m=offset_m, layout_m=layout_m, is_here=is_here)
-        _write(file, gathering, placement, frame or service, pitch_m)
-    _report_placed(how.as_json, file, placement, {}, "")
+        write_places(file, gathering, placement, frame or service, pitch_m)
+    report_placed(how.as_json, file, placement, {}, "")
 
 
 @command.command(
@@ -225,21 +207,22 @@ def finger(
     For robots that touch themselves: the pose of the hand is known in the coordinate frame of the skin, but the tip of
     the finger is not known exactly.
     """
+    from skinware.cli._gathering import GatheringOptions, opened, read_layout, report_placed, write_places
     from skinware.tactile.calibration.finger import place_finger
     from skinware.tactile.calibration.state import PressSession
 
-    how = _How(**options)
+    how = GatheringOptions(**options)
     session_of = partial(PressSession, wanted=touches, pose_shape=(4, 4))
     where = (service, poses_namespace, column, (4, 4))
-    with _opened(file, session_of, how, where) as (gathering, session):
+    with opened(file, session_of, how, where) as (gathering, session):
         structure, type_name = gathering.structure, gathering.type_name
-        _, shapes = _layout(structure, type_name, layout)
+        _, shapes = read_layout(structure, type_name, layout)
         gathering.run(_PRESS, how.share, how.duration_s)
         found = place_finger(session.presses, shapes, tip_m)
-        _write(file, gathering, found.placement, frame or service, pitch_m)
+        write_places(file, gathering, found, frame or service, pitch_m)
     tip = [round(number, 6) for number in found.tip_m.tolist()]
-    words = f"; the tip is at {', '.join(f'{_MM * number:.1f}' for number in tip)} mm"
-    _report_placed(how.as_json, file, found.placement, {"tip_m": tip}, words)
+    words = f"; the tip is at {', '.join(f'{1e3 * number:.1f}' for number in tip)} mm"
+    report_placed(how.as_json, file, found, {"tip_m": tip}, words)
 
 
 @command.command(
@@ -260,15 +243,15 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
 
     Exit status: 0 nothing found, 1 something is wrong.
     """
-    from skinware.cli._gathering import finding_data, finding_text
+    from skinware.cli._gathering import GatheringOptions, finding_data, finding_text, opened
     from skinware.geometry import read_geometry
     from skinware.tactile.calibration.checking import check_file, check_strokes
     from skinware.tactile.calibration.state import StrokeSession
     from skinware.tactile.calibration.topology import topology_of
 
     geometry = read_geometry(file)
-    how = _How(**options)
-    with _opened(file, StrokeSession, how) as (gathering, session):
+    how = GatheringOptions(**options)
+    with opened(file, StrokeSession, how) as (gathering, session):
         gathering.run(_STROKE, how.share, how.duration_s)
         structure, type_name = gathering.structure, gathering.type_name
     places, module = geometry.of(structure, type_name), structure.module_of(type_name)
@@ -316,16 +299,17 @@ def force(
 
     Exit status: 0 the curves can be trusted, 1 they are written, and cannot.
     """
+    from skinware.cli._gathering import GatheringOptions, opened
     from skinware.tactile.calibration.force import fit_force
     from skinware.tactile.calibration.sources import ForceSource
     from skinware.tactile.calibration.state import ForceSession
     from skinware.tactile.curves import curves_to_toml
 
-    how = _How(**options)
+    how = GatheringOptions(**options)
     if (reference is None) == (not newtons) and how.duration_s != 0:
         raise click.UsageError("give either --reference or --newtons")
     where = None if reference is None else (reference, how.namespace, column, (int(axes),))
-    with _opened(file, ForceSession, how, where) as (gathering, session):
+    with opened(file, ForceSession, how, where) as (gathering, session):
         source = gathering.poses = ForceSource(gathering.source, gathering.poses)
         for weight_n in newtons:
             gathering.weigh(weight_n, weight_s, source)
@@ -344,81 +328,6 @@ def force(
     done = {"event": "done", "file": str(file), "curves": own, **figures}
     say(how.as_json, done, f"{file}: {own} sensors; {words}")
     click.get_current_context().exit(cli.EXIT_FAILED if doubts else cli.EXIT_DONE)
-
-
-@contextmanager
-def _opened(
-    file: Path,
-    session_of: Callable[[int], Any],
-    how: _How,
-    poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
-) -> Iterator[tuple[Gathering, Any]]:
-    """Yield a gathering, with driver and poses open, and its session."""
-    from skinware.cli._gathering import Gathering
-    from skinware.memory.namespace import Namespace
-    from skinware.service import ServiceReader
-    from skinware.tactile.calibration.sources import LoadSource, PoseSource
-    from skinware.views.live import reader_of
-
-    with ExitStack() as stack:
-        reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))
-        source = LoadSource(reader.structure, reader.driver_type, how.type_name)
-        pose_source = None
-        if poses is not None:
-            service, poses_namespace, column, shape = poses
-            place = Namespace(poses_namespace or how.namespace)
-            pose_reader = stack.enter_context(ServiceReader(service, namespace=place, timeout_s=_POSES_TIMEOUT_S))
-            pose_source = PoseSource(pose_reader, column, shape)
-        state_path = how.state or file.with_name(f"{file.name}.state.npz")
-        session = session_of(len(reader.structure.module_of(source.type_name)))
-        gathering = Gathering(reader, session, source, pose_source, state_path, fresh=how.fresh, as_json=how.as_json)
-        yield gathering, session
-
-
-def _layout_m(places: Geometry, frame: str) -> tuple[npt.NDArray[np.float64], bool]:
-    """Places in the coordinate frame ``frame``, or else in the one with the most places; whether it is that frame."""
-    from collections import Counter
-
-    import numpy as np
-
-    frames = Counter(places.frame[places.known].tolist())
-    here = frame if frame in frames else max(frames, key=lambda name: frames[name])
-    return np.where((places.frame == here)[:, None], places.position_m, np.nan), here == frame
-
-
-def _layout(structure: Structure, type_name: str, layout: Path) -> tuple[Geometry, Mapping[int, Shape]]:
-    """Return the places of sensors in a file, and the shapes of the modules that have places there."""
-    from skinware.geometry import read_geometry
-    from skinware.tactile.calibration.shapes import shapes_of
-
-    places = read_geometry(layout).of(structure, type_name)
-    kinds = [bytes(kind).decode() for kind in structure.module_kind.tolist()]
-    shapes = shapes_of(structure.module_of(type_name), kinds, places.position_m, places.normal)
-    if not shapes:
-        raise ConfigurationError(f"{layout}: no whole module of this driver has places in it")
-    return places, shapes
-
-
-def _write(file: Path, gathering: Gathering, placement: Placement, frame: str, pitch_m: float) -> None:
-    from skinware.geometry import geometry_to_toml
-    from skinware.tactile.calibration.results import placed_comment, placed_groups
-
-    structure, type_name = gathering.structure, gathering.type_name
-    if not placement.known.any():
-        raise click.ClickException("no sensor was pressed often enough; nothing is written")
-    groups = placed_groups(structure, type_name, placement, frame, pitch_m)
-    file.write_text(geometry_to_toml(groups, placed_comment(structure, type_name, placement)), encoding="utf-8")
-
-
-def _report_placed(as_json: bool, file: Path, placement: Placement, also: Mapping[str, Any], words: str) -> None:
-    known, wrong = int(placement.known.sum()), int(placement.wrong.sum())
-    tool, residual_mm = placement.tool, _MM * placement.spread_m
-    figures = {"placed": known, "wrong": wrong, "residual_m": round(placement.spread_m, 6)}
-    of_tool = {"corrected": tool.found, "doubts": tool.doubts, "unchecked_m": tool.unchecked}
-    text = f"{file}: {known} sensors placed, {wrong} presses left out, residual {residual_mm:.1f} mm{words}"
-    text = "\n".join([text, *tool.words()])
-    say(as_json, {"event": "done", "file": str(file), **figures, **of_tool, **also}, text)
-    click.get_current_context().exit(cli.EXIT_FAILED if tool.doubts else cli.EXIT_DONE)
 
 
 main = partial(cli.run, command)

@@ -91,7 +91,6 @@ def command(
     from skinware.tactile.calm_service import CalmService
     from skinware.tactile.chain import ChainSettings
     from skinware.tactile.chain_state import default_path
-    from skinware.tactile.derived_services import WatchedRegions
     from skinware.tactile.regions import read_regions
     from skinware.text import nearest_name
     from skinware.views.robot import read_robot
@@ -111,7 +110,8 @@ def command(
         group=group,
         state_path=state_path or default_path(target.name, name),
         contacts=contacts or None,
-        watched=WatchedRegions(read_regions(*region_files), motion) if region_files else None,
+        regions=read_regions(*region_files) if region_files else None,
+        motion=motion,
         poses=read_robot(links).poses if links else None,
         health=health or None,
     )

@@ -1,7 +1,10 @@
-"""``skin-convert``: write a recording in the formats of other programs."""
+"""``skin-convert``: write a recording in the formats of other programs, or make one of their data."""
 
 from __future__ import annotations
 
+import contextlib
+import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -91,6 +94,7 @@ _learning_options = cli.options(
         "--each-structure", is_flag=True, help="lerobot: a set for each structure of the drivers, in folders 1, 2 ..."
     ),
 )
+_PROGRESS_S = 2.0
 _FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap", "foxglove", "ros2")
 _WIRE_FORMATS = ("candump", "pcapng")
 _LEARNING_FORMATS = ("lerobot",)
@@ -106,6 +110,8 @@ _LEARNING_FORMATS = ("lerobot",)
     "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
     "skin-convert walk.mcap --to ros2                       a bag of ROS 2",
     "skin-convert pick.mcap --to lerobot --fps 30 --join observation.state=joints.csv    a learning set",
+    "skin-convert data.csv --guess > map.toml               your own data: which columns are taxels?",
+    "skin-convert data.csv --map map.toml --to mcap         a recording of them",
 )
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @cli.names_argument
@@ -113,9 +119,16 @@ _LEARNING_FORMATS = ("lerobot",)
     "--to",
     "format_name",
     type=click.Choice(_FORMATS + _WIRE_FORMATS + _LEARNING_FORMATS),
-    required=True,
     help="Format to write.",
 )
+@click.option(
+    "--map",
+    "map_file",
+    metavar="MAP",
+    type=cli.FILE,
+    help="FILE is of another program (CSV, NPZ, Parquet, LeRobot, a bag of ROS, YARP's data.log); MAP has its columns.",
+)
+@click.option("--guess", is_flag=True, help="Print a MAP for FILE, with a comment for each guess.")
 @cli.output_option("The new file, or folder for csv, parquet, ros2 and lerobot.  [default: beside FILE]", metavar="OUT")
 @click.option("--type", "types", metavar="TYPE", multiple=True, help="Only sensors of TYPE; may be repeated.")
 @cli.parts_options
@@ -126,7 +139,9 @@ _LEARNING_FORMATS = ("lerobot",)
 def command(
     file: Path,
     names: tuple[str, ...],
-    format_name: str,
+    format_name: str | None,
+    map_file: Path | None,
+    guess: bool,
     output: Path | None,
     types: tuple[str, ...],
     patches: tuple[str, ...],
@@ -139,6 +154,8 @@ def command(
 ) -> None:
     """Write a recording in another format: all drivers and services in it, or only NAME...
 
+    With --map, FILE is data of another program, of which a recording (--to mcap) or another format is made.
+
     candump and pcapng contain the frames on the buses, if they were recorded (skin-record --wire). lerobot is a
     learning set (LeRobot's dataset v3.0): rows at a fixed rate, in episodes, with joints and cameras beside the skin.
 
@@ -146,6 +163,14 @@ def command(
     """
     from skinware.conversion import Selection, convert, convert_wires
 
+    if guess:
+        cli.refuse_others("--guess", ["file"])
+        _print_guess(file)
+        return
+    if format_name is None:
+        raise click.UsageError("Missing option '--to'.")
+    if map_file is not None:
+        cli.refuse_others("--map", ["file", "map_file", "format_name", "output", "as_json"])
     selection = Selection(names, types, patches, cli.regions_asked_for(in_regions, region_files), in_regions)
     if end_s is not None and end_s <= start_s:
         raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
@@ -156,7 +181,9 @@ def command(
     stop = Event()
     with cli.signals_end(stop.set):  # not inside a library
         time_and_end: dict[str, Any] = {"start_s": start_s, "end_s": end_s, "is_stopped": stop.is_set}
-        if format_name in _LEARNING_FORMATS:
+        if map_file is not None:
+            converted = _imported(file, map_file, output, format_name, stop.is_set)
+        elif format_name in _LEARNING_FORMATS:
             converted = _learning_set(file, output, selection, learning, time_and_end)
         else:
             write = convert_wires if format_name in _WIRE_FORMATS else convert
@@ -170,6 +197,31 @@ def command(
         return
     frames = ", ".join(f"{count} frames of {name}" for name, count in converted.frames.items())
     echo(f"{converted.path}: {frames}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
+
+
+def _print_guess(file: Path) -> None:
+    from skinware.conversion.foreign import guess, open_source
+
+    with contextlib.closing(open_source(file)) as source:
+        echo(guess(source), nl=False)
+
+
+def _imported(
+    file: Path, map_file: Path, output: Path | None, format_name: str, is_stopped: Callable[[], bool]
+) -> Converted:
+    from skinware.conversion import FORMATS, convert_foreign
+
+    if format_name not in FORMATS:
+        raise click.UsageError(f"--map makes one of {', '.join(FORMATS)}; then convert the recording to {format_name}")
+    shown_s = time.monotonic()
+
+    def report(share: float) -> None:
+        nonlocal shown_s
+        if time.monotonic() - shown_s >= _PROGRESS_S:
+            shown_s = time.monotonic()
+            cli.warn(f"{file}: {share:.0%}")
+
+    return convert_foreign(file, output, format_name, map_file, report=report, is_stopped=is_stopped)
 
 
 def _learning_set(

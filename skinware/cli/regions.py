@@ -88,73 +88,60 @@ def paint(
     from skinware.memory.namespace import Namespace
     from skinware.tactile.regions import Region, put_region, read_regions
     from skinware.views.live import reader_of
+    from skinware.views.quantities import types_of
 
     if duration_s is None and not sys.stdin.isatty():
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
     if file.exists() and not force and name in [region.name for region in read_regions(file)]:
         raise ConfigurationError(f"{file}: there is a region {name!r} already; --force replaces it")
     with reader_of(Namespace(namespace), driver, "--driver") as reader:
-        painter = _Painter(reader, type_name, as_json)
-        stroked, in_region = painter.paint(duration_s)
-        uid = reader.structure.sensor_uid[reader.structure.index(painter.type_name)][in_region]
+        type_name = type_name or types_of(reader.structure)[0].name
+        stroked, in_region = _paint(reader, type_name, as_json, duration_s)
+        uid = reader.structure.sensor_uid[reader.structure.index(type_name)][in_region]
     if not len(uid):
         raise click.ClickException("nothing was touched; nothing is written")
-    put_region(file, Region(name, painter.type_name, (reader.name,), tuple(uid.tolist())), replace=force)
+    put_region(file, Region(name, type_name, (reader.name,), tuple(uid.tolist())), replace=force)
     holes = f", {len(uid) - stroked} of them holes that were closed" if len(uid) > stroked else ""
     done = {"event": "done", "region": name, "file": str(file), "touched": stroked, "sensors": len(uid)}
-    say(as_json, done, f"{file}: {name}, {len(uid)} {painter.type_name} sensors of {reader.name}{holes}")
+    say(as_json, done, f"{file}: {name}, {len(uid)} {type_name} sensors of {reader.name}{holes}")
 
 
-class _Painter:
-    """Collect the sensors that are touched."""
+def _paint(
+    reader: DriverReader, type_name: str, as_json: bool, duration_s: float | None
+) -> tuple[int, npt.NDArray[np.bool_]]:
+    """Paint until Enter or for this time; return the number of touched sensors, and (n,) bool: the region."""
+    import numpy as np
 
-    def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
-        from skinware.views.history import DriverRest
-        from skinware.views.quantities import types_of
+    from skinware.tactile.neighbours import neighbours, without_holes
+    from skinware.views.history import SETTLING_S, DriverRest, threshold
+    from skinware.views.live import after, enter_pressed, frames_until
+    from skinware.views.quantities import physical_values
 
-        self._reader, self._as_json = reader, as_json
-        self.type_name: str = types_of(reader.structure)[0].name if type_name is None else type_name
-        self._index = reader.structure.index(self.type_name)
-        self._rest = DriverRest(reader.structure)
+    structure = reader.structure
+    index, rest = structure.index(type_name), DriverRest(structure)
 
-    def paint(self, duration_s: float | None) -> tuple[int, npt.NDArray[np.bool_]]:
-        """Paint until Enter or for this time; return the number of touched sensors, and (n,) bool: the region."""
-        import numpy as np
-
-        from skinware.tactile.neighbours import neighbours, without_holes
-        from skinware.views.history import SETTLING_S
-        from skinware.views.live import after, enter_pressed, frames_until
-
-        for frame in frames_until(self._reader, after(SETTLING_S)):
-            self._touched(frame)
-        stroked = np.zeros(len(self._reader.structure.module_of(self.type_name)), bool)
-        self._say("ready", f"stroke the region{' and press Enter' if duration_s is None else ''}", stroked)
-        is_due = after(_REPORT_EVERY_S)
-        for frame in frames_until(self._reader, enter_pressed if duration_s is None else after(duration_s)):
-            stroked |= self._touched(frame)
-            if is_due():
-                is_due = after(_REPORT_EVERY_S)
-                self._say("painting", f"{stroked.sum()} sensors", stroked)
-        geometry = self._reader.structure.geometry
-        if geometry is None:
-            return int(stroked.sum()), stroked
-        return int(stroked.sum()), without_holes(stroked, neighbours(geometry[self._index]))
-
-    def _touched(self, frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
+    def touched(frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
         """Return (n,) bool: the sensors of the type that are far from rest."""
-        from skinware.views.history import threshold
-        from skinware.views.quantities import physical_values
+        physical, fresh = physical_values(frame), frame.status == 0
+        rest.follow(physical, fresh, frame.published_ns)
+        is_far = rest.change(physical)[index] > threshold(rest.noise(type_name))
+        is_touched: npt.NDArray[np.bool_] = fresh[index] & is_far
+        return is_touched
 
-        physical = physical_values(frame)
-        fresh = frame.status == 0
-        self._rest.follow(physical, fresh, frame.published_ns)
-        change = self._rest.change(physical)[self._index]
-        touched: npt.NDArray[np.bool_] = fresh[self._index] & (change > threshold(self._rest.noise(self.type_name)))
-        return touched
-
-    def _say(self, event: str, text: str, stroked: npt.NDArray[np.bool_]) -> None:
-        what = {"driver": self._reader.name, "type": self.type_name} if event == "ready" else {}
-        say(self._as_json, {"event": event, **what, "touched": int(stroked.sum())}, text)
+    for frame in frames_until(reader, after(SETTLING_S)):
+        touched(frame)
+    stroked = np.zeros(len(structure.module_of(type_name)), bool)
+    ready = {"event": "ready", "driver": reader.name, "type": type_name, "touched": 0}
+    say(as_json, ready, f"stroke the region{' and press Enter' if duration_s is None else ''}")
+    is_due = after(_REPORT_EVERY_S)
+    for frame in frames_until(reader, enter_pressed if duration_s is None else after(duration_s)):
+        stroked |= touched(frame)
+        if is_due():
+            is_due, count = after(_REPORT_EVERY_S), int(stroked.sum())
+            say(as_json, {"event": "painting", "touched": count}, f"{count} sensors")
+    if structure.geometry is None:
+        return int(stroked.sum()), stroked
+    return int(stroked.sum()), without_holes(stroked, neighbours(structure.geometry[index]))
 
 
 main = partial(cli.run, command)

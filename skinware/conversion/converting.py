@@ -92,12 +92,52 @@ def convert(
     form = FORMATS[format_name]
     target = new_target(path, target, form.suffix)
     with contextlib.closing(RecordedSource(path, start_s, end_s, selection, is_stopped)) as source:
-        with begun_beside(target) as begun:
-            form.write(source, begun)
-            if not source.frames.total():
-                raise ConfigurationError(f"{path}: no sample of the selection was recorded in that time")
-        notes = [f"{target}: {note}" for note in form.without(source)]
-        return Converted(target, source.frames, [*source.problems, *notes])
+        return _written(source, target, form, "no sample of the selection was recorded in that time")
+
+
+def convert_foreign(
+    path: Path,
+    target: Path | None,
+    format_name: str,
+    map_path: Path,
+    *,
+    report: Callable[[float], object] = lambda _: None,
+    is_stopped: Callable[[], bool] = lambda: False,
+) -> Converted:
+    """Write data of another program as a recording, or in another format.
+
+    Args:
+        path: of the data, see :func:`skinware.conversion.foreign.open_source`; they are only read.
+        target, format_name, is_stopped: as for :func:`convert`.
+        map_path: the map from columns to taxels.
+        report: called now and then with the part that is done, 0 to 1.
+
+    Raises:
+        ConfigurationError: the data are nothing that is known, or damaged, or the map does not fit them.
+        MissingExtra: a package of the extra ``convert`` is not installed.
+        OSError: the data cannot be read, or the target cannot be written.
+    """
+    from skinware.conversion.foreign import ImportedSource, open_source
+
+    form = FORMATS[format_name]
+    target = new_target(path, target, form.suffix)
+    with contextlib.closing(open_source(path)) as columns:
+        return _written(ImportedSource(columns, map_path, report, is_stopped), target, form, "no row in it")
+
+
+class _CountedSource(TableSource, Protocol):
+    """A source that counts the samples it has given."""
+
+    frames: Counter[str]
+
+
+def _written(source: _CountedSource, target: Path, form: Format, why_empty: str) -> Converted:
+    with begun_beside(target) as begun:
+        form.write(source, begun)
+        if not source.frames.total():
+            raise ConfigurationError(f"{source.path}: {why_empty}")
+    notes = [f"{target}: {note}" for note in form.without(source)]
+    return Converted(target, source.frames, [*source.problems, *notes])
 
 
 def new_target(path: Path, target: Path | None, suffix: str) -> Path:

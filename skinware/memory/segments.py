@@ -252,6 +252,19 @@ def head_like(segment: Segment, schema: Schema, static: Mapping[str, npt.NDArray
     return data.tobytes()
 
 
+def head_of(name: str, schema: Schema, static: Mapping[str, npt.NDArray[Any]], *, kind: str, period_ns: int) -> bytes:
+    """Return the head of a generation that no writer made, as :func:`recorded` reads it.
+
+    Raises:
+        ConfigurationError: the format cannot hold these columns and tables.
+    """
+    static = {**static, **schema.for_file(static)}
+    layout = file_layout.plan(static, schema.for_layout(), None, period_ns)
+    data = np.zeros(layout.slot_offset, np.uint8)
+    _write_head(data, _header(name, layout, layout.digest(static), kind, period_ns, 0), layout, static)
+    return data.tobytes()
+
+
 def current_inode(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     """(device, inode) of the present file of a service, which has that path; None if there is none."""
     try:

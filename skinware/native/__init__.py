@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from skinware.errors import PlatformError
 
-__all__ = ["ABI", "Library", "core", "give_arrays", "load", "read_structs"]
+__all__ = ["ABI", "Library", "core", "load"]
 
 ABI = 11
 """Number of the interface of ``library.c``: both change together."""

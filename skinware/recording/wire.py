@@ -18,14 +18,9 @@ from typing import BinaryIO
 
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.recording.reading import Recording
-from skinware.recording.wire_tracks import WireItem, WireTrack
+from skinware.recording.wire_tracks import WireTrack
 from skinware.text import nearest_name
-from skinware.wire import IS_CUT, IS_FD, candump_line, channel_name
-
-SOCKETCAN, SERIAL = 227, 147
-"""Link types of interfaces in pcapng: LINKTYPE_CAN_SOCKETCAN, and LINKTYPE_USER0 with :data:`SERIAL_HEADER`."""
-SERIAL_HEADER = struct.Struct("<BBH")
-"""In front of the bytes of a packet of a serial line: version (1), 0 received or 1 sent, 0."""
+from skinware.wire import IS_CUT, IS_FD, SERIAL, SERIAL_HEADER, SOCKETCAN, WireItem, candump_line, channel_name
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _NAME, _DESCRIPTION, _RESOLUTION, _FLAGS = 2, 3, 9, 2

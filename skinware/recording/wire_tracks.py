@@ -19,7 +19,7 @@ import numpy.typing as npt
 from skinware.limits import LIMITS
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S
-from skinware.wire import read_pieces
+from skinware.wire import WireItem, read_pieces
 
 if TYPE_CHECKING:
     from skinware.recording.reading import Recording
@@ -67,26 +67,6 @@ class WirePiece(NamedTuple):
     time_ns: npt.NDArray[np.int64]
     epoch_ns: npt.NDArray[np.int64]
     frames: npt.NDArray[np.void] | None
-    data: bytes
-
-
-class WireItem(NamedTuple):
-    """A frame of a CAN bus, or bytes of a serial line that were read or written together.
-
-    Attributes:
-        time_ns: CLOCK_MONOTONIC.
-        epoch_ns: the same, ns since 1970.
-        is_sent: the driver sent it; False: it received it.
-        identifier: with the flags of linux/can.h; None for bytes.
-        flags: of ``skinware.wire.ROWS``.
-        data: payload, or bytes.
-    """
-
-    time_ns: int
-    epoch_ns: int
-    is_sent: bool
-    identifier: int | None
-    flags: int
     data: bytes
 
 

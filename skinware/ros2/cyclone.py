@@ -25,18 +25,23 @@ try:
 except (ImportError, AttributeError):  # it is not public
     write_bytes = None
 
-_FIELD = re.compile(r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE)
+_FIELD = re.compile(
+    r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<most><=)?(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE
+)
 _ADDRESS = re.compile(r"^\d+(\.\d+){3}$|:")
 _PLAIN = {
     "bool": bool,
     "byte": idl.uint8,
+    "char": idl.uint8,
     "float32": idl.float32,
     "float64": idl.float64,
+    "int8": idl.int8,
     "int16": idl.int16,
     "int32": idl.int32,
     "int64": idl.int64,
     "string": str,
     "uint8": idl.uint8,
+    "uint16": idl.uint16,
     "uint32": idl.uint32,
     "uint64": idl.uint64,
 }
@@ -82,22 +87,28 @@ def struct_type(name: str, texts: Mapping[str, str], before: Mapping[str, Any] |
     """Return a type for Cyclone DDS, which checks incoming messages by it.
 
     Args:
-        name: in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``.
+        name: in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``; a name
+            with one slash is of no type of ROS, and the same in DDS.
         texts: definitions as in a ``.msg`` file, by type; names of messages are without ``msg``.
         before: fields that come first.
     """
     fields: dict[str, Any] = dict(before or {})
+    *package, plain = name.split("/")
+    is_of_ros = len(package) > 1
     for field in _FIELD.finditer(texts[name.replace("/msg/", "/")]):
-        kind: Any = _PLAIN.get(field["type"]) or struct_type(field["type"].replace("/", "/msg/"), texts)
+        inner = field["type"].replace("/", "/msg/" if is_of_ros else "/")
+        kind: Any = _PLAIN.get(field["type"]) or struct_type(inner, texts)
         if field["bound"]:
             kind = idl.bounded_str[int(field["bound"])]
-        if field["length"]:
+        if field["most"]:
+            kind = idl.sequence[kind, int(field["length"])]
+        elif field["length"]:
             kind = idl.array[kind, int(field["length"])]
         elif field["length"] is not None:
             kind = idl.sequence[kind]
         fields[field["name"]] = kind
-    package, kind, plain = name.split("/")
-    made: type[IdlStruct] = make_idl_struct(plain, f"{package}.{kind}.dds_.{plain}_", fields)
+    full = f"{'.'.join(package)}.dds_.{plain}_" if is_of_ros else f"{package[0]}.{plain}"
+    made: type[IdlStruct] = make_idl_struct(plain, full, fields)
     return made
 
 

@@ -59,9 +59,8 @@ class BaselineStage(Stage):
         self.before = taxels
         before = taxels.type
         span = before.maximum - before.minimum
-        self.taxels = replace(
-            taxels, type=replace(before, minimum=-span if taxels.signed else 0.0, maximum=span), resolution=0.0
-        )
+        calmed = replace(before, minimum=-span if taxels.signed else 0.0, maximum=span)
+        super().__init__(replace(taxels, type=calmed, resolution=0.0))
         self.baseline = Baseline(
             taxels.module,
             taxels.patch,

@@ -20,12 +20,13 @@ from skinware.service import Request
 from skinware.service.messages import ACQUIRE
 from skinware.state import count_reasons
 from skinware.status import Why
-from skinware.tactile import contacts_service, health_service
+from skinware.tactile import contacts_service, health_service, motion_service
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_driver import CalmedDriver, DriverSource
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState
-from skinware.tactile.derived_services import CalmContacts, CalmHealth, WatchedRegions
+from skinware.tactile.derived_services import CalmContacts, CalmHealth
+from skinware.tactile.regions import Regions
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -131,7 +132,8 @@ class CalmService:
         group: group whose members may read it.
         state_path: file that keeps what was learned; None: it is not kept.
         contacts: name of the service of its contacts, in the namespace of the calmed driver; None: there is none.
-        watched: regions whose motion is published beside the contacts; None: none.
+        regions: regions whose motion is published beside the contacts; None: none.
+        motion: name of the service of their motion, in the same namespace.
         poses: by name of a coordinate frame, (4, 4) its pose on the robot: contacts hang together across its border.
         health: name of the service of its sensors' health, in the same namespace; None: there is none.
 
@@ -155,7 +157,8 @@ class CalmService:
         group: str | None = None,
         state_path: Path | None = None,
         contacts: str | None = contacts_service.NAME,
-        watched: WatchedRegions | None = None,
+        regions: Regions | None = None,
+        motion: str = motion_service.NAME,
         poses: Mapping[str, npt.ArrayLike] | None = None,
         health: str | None = health_service.NAME,
     ) -> None:
@@ -166,7 +169,9 @@ class CalmService:
             raise ConfigurationError(f"{name!r} is in namespace {self.into.name!r} itself: give another with --into")
         self.frames = 0
         self.restored = 0
-        self.contacts = CalmContacts(contacts, name, self.into, group, watched, poses) if contacts else None
+        self.contacts = None
+        if contacts:
+            self.contacts = CalmContacts(contacts, name, self.into, group, regions, motion, poses)
         self.health = CalmHealth(health, name, self.into, group) if health else None
         self._settings = settings or ChainSettings.calm()
         self._learned = LearnedState(state_path, self.health)

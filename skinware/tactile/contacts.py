@@ -312,17 +312,11 @@ class Contacts:
             "peak": peak,
             "n": np.bincount(contact, minlength=count),
             "area_m2": np.where(has_area, areas, np.nan),
-            "force_n": self._forces(loads, np.where(has_area, forces, np.nan)),
+            "force_n": {"N": loads, "Pa": np.where(has_area, forces, np.nan)}.get(self._unit, np.full(count, np.nan)),
             "cop_m": total[:, 5:8] / np.where(weights > 0, weights, np.nan)[:, None],
             "normal": normal / np.where(length > 0, length, np.nan)[:, None],
             "frame": frame,
         }
-
-    def _forces(
-        self, of_newtons: npt.NDArray[np.float64], of_pascals: npt.NDArray[np.float64]
-    ) -> npt.NDArray[np.float64]:
-        nothing = np.full(len(of_newtons), np.nan)
-        return {"N": of_newtons, "Pa": of_pascals}.get(self._unit, nothing)
 
     def _whole(
         self, found: dict[str, npt.NDArray[Any]], cut: npt.NDArray[np.float64], load: npt.NDArray[np.float64]

@@ -16,33 +16,31 @@ columns: ``sensor_uid`` of each taxel, ``frame_name``, and ``driver``, ``type_na
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Self, TypedDict, Unpack
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.onsets import ContactEvent, Events
 from skinware.tactile.source_service import (
+    ServiceForm,
     ServiceOptions,
+    Source,
     SourceReader,
     SourceSample,
     SourceWriter,
-    Static,
-    ValueSource,
 )
 from skinware.tactile.tracking import TrackingSettings
 
 NAME = "contacts"
 
-_TEXTS = {
+_ABOUT: dict[str, tuple[str | None, str]] = {
     "id": ("", "the same as long as the contact lasts; 0: this row is empty"),
     "age_s": ("s", "since it began"),
-    "load": ("", "sum of the values of its taxels"),
-    "peak": ("", "the largest of them"),
+    "load": (None, "sum of the values of its taxels"),
+    "peak": (None, "the largest of them"),
     "area_m2": ("m2", "that its taxels stand for"),
     "force_n": ("N", "of values in N, or of pressures in Pa by area"),
     "n": ("", "number of its taxels"),
@@ -53,45 +51,23 @@ _TEXTS = {
     "kind": ("", "0: a touch, 1: a hold, 2: sliding"),
     "provisional": ("", "1: only its last frames speak for it, and its load is 0"),
     "clipped": ("", "number of its taxels that are at the end of their range"),
-    "load_whole": ("", "estimate of the load with what threshold and clipping cut off; NaN: most of it is"),
-    "uncertainty": ("", "how much of the load could be noise or drift; NaN: not known"),
+    "load_whole": (None, "estimate of the load with what threshold and clipping cut off; NaN: most of it is"),
+    "uncertainty": (None, "how much of the load could be noise or drift; NaN: not known"),
     "count": ("", "number of rows that are filled"),
     "beyond": ("", "contacts for which there was no row"),
     "contact_of": ("", "row of the contact of each taxel; -1: none, -2: one for which there was no row"),
 }
 
 
-@dataclass(frozen=True)
-class ContactsSource(ValueSource):
-    """The values that contacts are found in.
-
-    Attributes:
-        uid: (n,) uint64, of the n taxels.
-    """
-
-    uid: npt.NDArray[np.uint64]
-
-    @classmethod
-    def read(cls, static: Static) -> Self:
-        """See :class:`Source`."""
-        return cls(**cls.values(static), uid=static["sensor_uid"].astype(np.uint64))
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Source`."""
-        return {"sensor_uid": self.uid, **super().static()}
-
-    def columns(self) -> dict[str, Column]:
-        """See :class:`Source`."""
-        forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
-        forms |= {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", self.uid.shape)}
-        units = {name: unit for name, (unit, _) in _TEXTS.items()}
-        units |= dict.fromkeys(("load", "peak", "load_whole", "uncertainty"), self.unit)
-        return {
-            name: Column(np.dtype(dtype), shape, units[name], _TEXTS[name][1]) for name, (dtype, shape) in forms.items()
-        }
+def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
+    forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
+    return forms | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", source.uid.shape)}
 
 
-class ContactsSample(SourceSample[ContactsSource]):
+_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "uid"), _ABOUT, _columns_of)
+
+
+class ContactsSample(SourceSample):
     """The contacts of one frame; iterate over it for each of them, the oldest first."""
 
     __slots__ = ("_contacts",)
@@ -115,7 +91,7 @@ class ContactsSample(SourceSample[ContactsSource]):
         return iter(self.contacts)
 
 
-class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
+class ContactsReader(SourceReader[ContactsSample]):
     """Reads the service ``contacts``: a :class:`skinware.service.ServiceReader` whose samples are contacts.
 
     Args:
@@ -126,8 +102,7 @@ class ContactsReader(SourceReader[ContactsSource, ContactsSample]):
         BadServiceFile: the service is of another kind.
     """
 
-    kind = NAME
-    source_class = ContactsSource
+    form = _FORM
     frame_class = ContactsSample
 
     def events(self, *, timeout_s: float | None = None) -> Iterator[ContactEvent]:
@@ -149,7 +124,7 @@ class More(TypedDict, total=False):
     uncertainty: npt.NDArray[Any] | None
 
 
-class ContactsWriter(SourceWriter[ContactsSource]):
+class ContactsWriter(SourceWriter):
     """Finds the contacts in a driver's values, and publishes them.
 
     Args:
@@ -168,7 +143,7 @@ class ContactsWriter(SourceWriter[ContactsSource]):
         ConfigurationError: the neighbours are not of these sensors.
     """
 
-    kind = NAME
+    form = _FORM
 
     def __init__(
         self,
@@ -226,6 +201,6 @@ class ContactsWriter(SourceWriter[ContactsSource]):
         self._contacts = contacts
 
 
-def _source(structure: Structure, type_name: str, driver: str, contacts: Contacts) -> ContactsSource:
+def _source(structure: Structure, type_name: str, driver: str, contacts: Contacts) -> Source:
     unit, uid = structure.type(type_name).unit, structure.sensor_uid[structure.index(type_name)]
-    return ContactsSource(driver, type_name, unit, contacts.frames, uid)
+    return Source(driver, type_name, unit, contacts.frames, uid=uid)

@@ -37,7 +37,6 @@ import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
 from skinware.tactile.rule import UNUSABLE
 from skinware.tactile.stages import Floats, Signal, Stage, StageSettings, Taxels
 from skinware.toml_text import TomlText
@@ -283,16 +282,14 @@ class CurveStage(Stage):
         meant = replace(
             taxels.type, unit=table.unit, minimum=float(table.minimum.min()), maximum=float(table.maximum.max())
         )
-        self.taxels = replace(taxels, type=meant, resolution=0.0)
+        super().__init__(replace(taxels, type=meant, resolution=0.0))
         self.table = table
         self.temperature_c = math.nan
         self.error: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
-        self._time_ns: int | None = None
 
     def step(self, signal: Signal) -> None:
-        passed_s = 0.0 if self._time_ns is None else max(signal.time_ns - self._time_ns, 0) / NS_PER_S
-        self._time_ns, given = signal.time_ns, signal.values
-        signal.values = self.table.step(given, passed_s, self.temperature_c)
+        given = signal.values
+        signal.values = self.table.step(given, self._passed_s(signal), self.temperature_c)
         self.error = self.table.error(given, signal.values)
 
 

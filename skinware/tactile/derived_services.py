@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,35 +19,23 @@ from skinware.errors import ConfigurationError, NameInUse
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
+from skinware.tactile import motion_service
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.contacts import ContactSet
-from skinware.tactile.contacts_service import ContactsWriter
+from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
-from skinware.tactile.loads import Loads
-from skinware.tactile.motion_service import NAME, MotionWriter
-from skinware.tactile.neighbours import Table, neighbours, posed
+from skinware.tactile.motion_service import MotionWriter
+from skinware.tactile.neighbours import neighbours, posed
+from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
-from skinware.tactile.rule import UNUSABLE
+from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE
 from skinware.tactile.source_service import ServiceOptions, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
-WriterT = TypeVar("WriterT", bound=SourceWriter[Any])
+WriterT = TypeVar("WriterT", bound=SourceWriter)
 
 _HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
-
-
-@dataclass(frozen=True)
-class WatchedRegions:
-    """Regions whose motion is published.
-
-    Attributes:
-        regions: the regions.
-        name: name of the service.
-    """
-
-    regions: Regions
-    name: str = NAME
 
 
 class DerivedService(ABC, Generic[WriterT]):
@@ -75,10 +63,8 @@ class DerivedService(ABC, Generic[WriterT]):
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
         """Go on with another chain, of other sensors, at the nominal rate of the driver."""
-        try:
+        with self._or_none():
             self._follow(chain, rate_hz)
-        except (ConfigurationError, NameInUse) as error:  # places without neighbours; a name of another program
-            self._give_up(error)
 
     @abstractmethod
     def _follow(self, chain: Chain, rate_hz: float | None) -> None: ...
@@ -96,9 +82,81 @@ class DerivedService(ABC, Generic[WriterT]):
         except NameInUse:
             self._writer = make(f"{self._driver}-{self._name}")
 
-    def _give_up(self, error: Exception) -> None:
-        self.close()
-        log.warning("no %s of %r: %s", self.subject, self._driver, str(error))
+    @contextmanager
+    def _or_none(self) -> Iterator[None]:
+        """Withdraw the service if places have no neighbours, or another program takes its name."""
+        try:
+            yield
+        except (ConfigurationError, NameInUse) as error:
+            self.close()
+            log.warning("no %s of %r: %s", self.subject, self._driver, str(error))
+
+
+class Loads:
+    """The loads of n taxels of a chain: values of one type, or lengths of vectors of three.
+
+    Args:
+        chain: the chain.
+        names: the types; the contacts are those of the last one.
+
+    Attributes:
+        type_name: sensor type of the contacts.
+        n_sensors: number of all sensors of the chain.
+    """
+
+    def __init__(self, chain: Chain, names: tuple[str, ...]) -> None:
+        self.type_name, self.n_sensors = names[-1], chain.structure.n_sensors
+        self._stages = [chain.baseline_stages[name] for name in names]
+        self._indexes = [chain.structure.index(name) for name in names]
+        self._before = self._stages[-1].before
+        self._onsets = Onsets(len(self._before), self._before.resolution)
+
+    @classmethod
+    def of(cls, chain: Chain) -> Self | None:
+        """Return those of pressures, else of another type that a touch only raises, else of vectors; None: of none."""
+        rising = [name for name in chain.baseline_stages if not name.startswith(SIGNED_TYPES)]
+        if rising:
+            return cls(chain, ("pressure" if "pressure" in rising else rising[0],))
+        vectors = [names for names in chain.vectors if set(names) <= set(chain.baseline_stages)]
+        return cls(chain, vectors[0]) if vectors else None
+
+    def usable(self, status: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+        """Return (n,) bool, which taxels have values of this frame, of (n_sensors,) status."""
+        usable: npt.NDArray[np.bool_] = (status[self._indexes[0]] & UNUSABLE) == 0
+        for index in self._indexes[1:]:
+            usable &= (status[index] & UNUSABLE) == 0
+        return usable
+
+    def values(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Return (n,) loads of (n_sensors,) values."""
+        return _length([values[index] for index in self._indexes])
+
+    @property
+    def touched(self) -> npt.NDArray[np.bool_]:
+        """(n,) bool, which taxels are touched in the newest frame."""
+        touched: npt.NDArray[np.bool_] = np.logical_or.reduce([stage.touched for stage in self._stages])
+        return touched
+
+    def more(self, usable: npt.NDArray[np.bool_], unit: str) -> More:
+        """Return onsets, clipped taxels and (in the same unit) uncertainties, as far as they are known."""
+        calms = [(stage.given, stage.calm) for stage in self._stages if stage.calm is not None]
+        if not calms:
+            return {}
+        deviation = _length([given - calm.baseline for given, calm in calms])
+        doubt = _length([np.hypot(calm.noise, calm.uncertainty) for _, calm in calms]) / np.sqrt(np.float32(len(calms)))
+        known = np.logical_and.reduce([usable, *(calm.usable for _, calm in calms)])
+        clipped = np.logical_or.reduce([given >= self._before.type.maximum for given, _ in calms])
+        return {
+            "onset": self._onsets.update(deviation, doubt, known),
+            "clipped": clipped,
+            "uncertainty": doubt if unit == self._before.type.unit else None,
+        }
+
+
+def _length(axes: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+    """Return (n,) lengths of vectors, by their axes (n,) each; one axis is its own length, with its sign."""
+    length: npt.NDArray[np.float32] = axes[0] if len(axes) == 1 else np.sqrt(sum(axis**2 for axis in axes))
+    return length
 
 
 class CalmContacts(DerivedService[ContactsWriter]):
@@ -108,7 +166,8 @@ class CalmContacts(DerivedService[ContactsWriter]):
 
     Args:
         name, driver, into, group: as for :class:`DerivedService`.
-        watched: regions whose motion is published.
+        regions: regions whose motion is published; None: none.
+        motion: name of the service of their motion.
         poses: by name of a coordinate frame, (4, 4) its pose on the robot: contacts hang together across its border.
 
     Attributes:
@@ -124,50 +183,40 @@ class CalmContacts(DerivedService[ContactsWriter]):
         driver: str,
         into: Namespace,
         group: str | None = None,
-        watched: WatchedRegions | None = None,
+        regions: Regions | None = None,
+        motion: str = motion_service.NAME,
         poses: Mapping[str, npt.ArrayLike] | None = None,
     ) -> None:
         super().__init__(name, driver, into, group)
         self.count = 0
+        self.motion = None if regions is None else CalmMotion(motion, driver, into, group, regions)
         self._poses = poses or {}
-        self.motion: CalmMotion | None = None
-        if watched is not None:
-            self.motion = CalmMotion(watched.name, driver, into, group, watched.regions)
         self._loads: Loads | None = None
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
-        """See :class:`DerivedService`."""
         super().follow(chain, rate_hz)
         if self.motion is not None:
-            self.motion.contacts, self.motion.type_name = self._writer, self._type_name
+            self.motion.contacts = self._writer
             self.motion.follow(chain, rate_hz)
 
-    @property
-    def _type_name(self) -> str:
-        return "" if self._loads is None else self._loads.type_name
-
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
-        before = self._type_name
         self._loads, self.count = Loads.of(chain), 0
-        type_name, beside = self._type_name, self._neighbours(chain)
-        if self._writer is not None and type_name == before:
-            self._writer.restructure(chain.structure, neighbours=beside)
+        if self._loads is None:
+            super().close()
+            return
+        structure, type_name, beside = chain.structure, self._loads.type_name, None
+        if structure.geometry is not None and self._poses:
+            beside = neighbours(posed(structure.geometry[structure.index(type_name)], self._poses))
+        if self._writer is not None and self._writer.source.type_name == type_name:
+            self._writer.restructure(structure, neighbours=beside)
             return
         super().close()
-        if type_name:
-            options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
-            self._open(
-                lambda name: ContactsWriter(
-                    chain.structure, type_name, driver=self._driver, neighbours=beside, name=name, **options
-                )
+        options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
+        self._open(
+            lambda name: ContactsWriter(
+                structure, type_name, driver=self._driver, neighbours=beside, name=name, **options
             )
-
-    def _neighbours(self, chain: Chain) -> Table | None:
-        """Return (n, k) the neighbours, across the borders of frames with a pose; None: those within each frame."""
-        geometry = chain.structure.geometry
-        if geometry is None or not self._poses or not self._type_name:
-            return None
-        return neighbours(posed(geometry[chain.structure.index(self._type_name)], self._poses))
+        )
 
     def publish(self, values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
         """Find the contacts of the next frame, and publish them.
@@ -181,14 +230,11 @@ class CalmContacts(DerivedService[ContactsWriter]):
             return
         usable, loads = self._loads.usable(status), self._loads.values(values)
         more = self._loads.more(usable, self._writer.source.unit)
-        try:
+        with self._or_none():
             found = self._writer.publish(loads, self._loads.touched & usable, acquired_ns, **more)
-        except NameInUse as error:
-            self._give_up(error)
-            return
-        self.count = len(found)
-        if self.motion is not None:
-            self.motion.publish(found, loads, acquired_ns)
+            self.count = len(found)
+            if self.motion is not None:
+                self.motion.publish(found, loads, acquired_ns)
 
     def publish_none(self, time_ns: int) -> None:
         """Publish that nothing is touched, as the driver is dead."""
@@ -197,7 +243,6 @@ class CalmContacts(DerivedService[ContactsWriter]):
             self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
 
     def close(self) -> None:
-        """See :class:`DerivedService`."""
         super().close()
         self.count = 0
         if self.motion is not None:
@@ -209,7 +254,6 @@ class CalmMotion(DerivedService[MotionWriter]):
 
     Attributes:
         contacts: the service of the contacts that move; None: there is none.
-        type_name: sensor type of these contacts.
     """
 
     subject = "motion"
@@ -217,29 +261,31 @@ class CalmMotion(DerivedService[MotionWriter]):
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None, regions: Regions) -> None:
         super().__init__(name, driver, into, group)
         self.contacts: ContactsWriter | None = None
-        self.type_name = ""
         self._regions = regions
 
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
         self.close()
         if self.contacts is None:
             return
-        frames = self.contacts.source.frames
+        source = self.contacts.source
         options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
         self._open(
             lambda name: MotionWriter(
-                chain.structure, self.type_name, self._regions, frames, driver=self._driver, name=name, **options
+                chain.structure,
+                source.type_name,
+                self._regions,
+                source.frames,
+                driver=self._driver,
+                name=name,
+                **options,
             )
         )
 
     def publish(self, contacts: ContactSet, values: npt.NDArray[np.float32], acquired_ns: int) -> None:
         """Publish the motion of the next frame, from its contacts and (n,) values."""
-        if self._writer is None:
-            return
-        try:
-            self._writer.publish(contacts, values, acquired_ns)
-        except NameInUse as error:
-            self._give_up(error)
+        if self._writer is not None:
+            with self._or_none():
+                self._writer.publish(contacts, values, acquired_ns)
 
 
 class CalmHealth(DerivedService[HealthWriter]):
@@ -293,9 +339,7 @@ class CalmHealth(DerivedService[HealthWriter]):
             reports = self._health.reports()
             self._status = np.uint8(Status.UNHEALTHY) * self._health.faulty(reports)
             self.faulty = int(np.count_nonzero(self._status))
-            try:
-                if self._writer is not None:
+            if self._writer is not None:
+                with self._or_none():
                     self._writer.publish(reports, acquired_ns)
-            except NameInUse as error:
-                self._give_up(error)
         status |= self._status

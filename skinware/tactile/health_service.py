@@ -16,21 +16,25 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Self, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware._columns import texts
 from skinware.errors import ConfigurationError
-from skinware.service import Column
 from skinware.structure import Structure
 from skinware.tactile.baseline_stage import BaselineStage
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.health import Health
 from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
-from skinware.tactile.source_service import ServiceOptions, Source, SourceReader, SourceSample, SourceWriter, Static
+from skinware.tactile.source_service import (
+    ServiceForm,
+    ServiceOptions,
+    Source,
+    SourceReader,
+    SourceSample,
+    SourceWriter,
+)
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -38,7 +42,7 @@ NAME = "health"
 RATE_HZ = 1.0
 """How often it is published."""
 
-_TEXTS = {
+_ABOUT: dict[str, tuple[str | None, str]] = {
     "kind": ("", ", ".join(f"{kind:d}: {kind.name.lower().replace('_', ' ')}" for kind in HealthKind)),
     "value": ("", "the newest, in the unit of the type"),
     "still_s": ("s", "for how long it has not changed"),
@@ -57,39 +61,14 @@ _TEXTS = {
 }
 
 
-@dataclass(frozen=True)
-class HealthSource(Source):
-    """The sensors whose health is reported.
-
-    Attributes:
-        driver: name of the driver.
-        uid: (n,) uint64, of its n sensors, in the order of its frames.
-        type_id: (n,) uint32, of their types.
-    """
-
-    driver: str
-    uid: npt.NDArray[np.uint64]
-    type_id: npt.NDArray[np.uint32]
-
-    @classmethod
-    def read(cls, static: Static) -> Self:
-        """See :class:`Source`."""
-        uid, type_id = static["sensor_uid"].astype(np.uint64), static["sensor_type"].astype(np.uint32)
-        if uid.shape != type_id.shape:
-            raise ValueError(f"{len(uid)} uids of {len(type_id)} types")
-        return cls(texts(static["driver"])[0], uid, type_id)
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Source`."""
-        driver = np.array([self.driver.encode()], "S64")
-        return {"sensor_uid": self.uid, "sensor_type": self.type_id, "driver": driver}
-
-    def columns(self) -> dict[str, Column]:
-        """See :class:`Source`."""
-        return {name: Column(np.dtype(dtype), self.uid.shape, *_TEXTS[name]) for name, (dtype, _) in COLUMNS.items()}
+def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
+    return {name: (dtype, source.uid.shape) for name, (dtype, _) in COLUMNS.items()}
 
 
-class HealthSample(SourceSample[HealthSource]):
+_FORM = ServiceForm(NAME, ("driver", "uid", "type_id"), _ABOUT, _columns_of)
+
+
+class HealthSample(SourceSample):
     """The health of all sensors at one time."""
 
     __slots__ = ()
@@ -100,7 +79,7 @@ class HealthSample(SourceSample[HealthSource]):
         return HealthReport(**{name: self.column(name) for name in COLUMNS})
 
 
-class HealthReader(SourceReader[HealthSource, HealthSample]):
+class HealthReader(SourceReader[HealthSample]):
     """Reads the service ``health``: a :class:`skinware.service.ServiceReader` whose samples are reports.
 
     Args:
@@ -111,12 +90,11 @@ class HealthReader(SourceReader[HealthSource, HealthSample]):
         BadServiceFile: the service is of another kind.
     """
 
-    kind = NAME
-    source_class = HealthSource
+    form = _FORM
     frame_class = HealthSample
 
 
-class HealthWriter(SourceWriter[HealthSource]):
+class HealthWriter(SourceWriter):
     """Publishes the health of the sensors of a driver.
 
     Args:
@@ -126,13 +104,13 @@ class HealthWriter(SourceWriter[HealthSource]):
         options: namespace and group, as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
     """
 
-    kind = NAME
+    form = _FORM
 
     def __init__(
         self, structure: Structure, driver: str, *, name: str = NAME, **options: Unpack[ServiceOptions]
     ) -> None:
         self._structure = structure
-        source = HealthSource(driver, structure.sensor_uid, structure.sensor_type)
+        source = Source(driver, uid=structure.sensor_uid, type_id=structure.sensor_type)
         given: ServiceOptions = {"slots": 4, "rate_hz": RATE_HZ, **options}
         super().__init__(source, name, f"health of the sensors of {driver}", **given)
 
@@ -164,7 +142,7 @@ class HealthWriter(SourceWriter[HealthSource]):
         Raises:
             NamespaceError: shared memory is full; the old generation then goes on.
         """
-        self._restructure(HealthSource(self.source.driver, structure.sensor_uid, structure.sensor_type))
+        self._restructure(Source(self.source.driver, uid=structure.sensor_uid, type_id=structure.sensor_type))
         self._structure = structure
 
 

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.assignment import assign
-from skinware.tactile.tracks import LONGEST_GUESS_S, Floats, Tracks
+from skinware.tactile.tracks import LONGEST_GUESS_S, Floats, Tracks, assign
 
 _STEPS = 4
 _SMALL = 1e-9

@@ -14,33 +14,29 @@ Columns of a sample: those of :data:`skinware.tactile.motion.COLUMNS`, a row for
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Self, Unpack
+from typing import Any, Unpack
 
-import numpy as np
 import numpy.typing as npt
 
-from skinware._columns import texts
 from skinware.errors import ConfigurationError
-from skinware.service import Column
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion_of
 from skinware.tactile.regions import Regions
 from skinware.tactile.source_service import (
+    ServiceForm,
     ServiceOptions,
+    Source,
     SourceReader,
     SourceSample,
     SourceWriter,
-    Static,
-    ValueSource,
 )
 
 NAME = "motion"
 
-_TEXTS = {
-    "load": ("", "sum of the values of its touched sensors"),
+_ABOUT: dict[str, tuple[str | None, str]] = {
+    "load": (None, "sum of the values of its touched sensors"),
     "contacts": ("", "number of contacts that reach into it"),
     "velocity_m_s": ("m/s", "mean velocity of its contacts; NaN: none is known"),
     "speed_m_s": ("m/s", "length of it"),
@@ -48,35 +44,14 @@ _TEXTS = {
 }
 
 
-@dataclass(frozen=True)
-class MotionSource(ValueSource):
-    """The values and regions that motion is computed from.
-
-    Attributes:
-        regions: names of the regions.
-    """
-
-    regions: tuple[str, ...]
-
-    @classmethod
-    def read(cls, static: Static) -> Self:
-        """See :class:`Source`."""
-        return cls(**cls.values(static), regions=tuple(texts(static["region_name"])))
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """See :class:`Source`."""
-        return {"region_name": np.array([name.encode() for name in self.regions]), **super().static()}
-
-    def columns(self) -> dict[str, Column]:
-        """See :class:`Source`."""
-        units = {name: unit for name, (unit, _) in _TEXTS.items()} | {"load": self.unit}
-        return {
-            name: Column(np.dtype(dtype), (len(self.regions), *shape), units[name], _TEXTS[name][1])
-            for name, (dtype, shape) in COLUMNS.items()
-        }
+def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
+    return {name: (dtype, (len(source.regions), *shape)) for name, (dtype, shape) in COLUMNS.items()}
 
 
-class MotionSample(SourceSample[MotionSource]):
+_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "regions"), _ABOUT, _columns_of)
+
+
+class MotionSample(SourceSample):
     """The motion of all regions in one frame; iterate over it for each of them."""
 
     __slots__ = ()
@@ -91,7 +66,7 @@ class MotionSample(SourceSample[MotionSource]):
         return iter(self.motion)
 
 
-class MotionReader(SourceReader[MotionSource, MotionSample]):
+class MotionReader(SourceReader[MotionSample]):
     """Reads the service ``motion``: a :class:`skinware.service.ServiceReader` whose samples are motion.
 
     Args:
@@ -102,12 +77,11 @@ class MotionReader(SourceReader[MotionSource, MotionSample]):
         BadServiceFile: the service is of another kind.
     """
 
-    kind = NAME
-    source_class = MotionSource
+    form = _FORM
     frame_class = MotionSample
 
 
-class MotionWriter(SourceWriter[MotionSource]):
+class MotionWriter(SourceWriter):
     """Publishes the motion of a driver's regions.
 
     Args:
@@ -125,7 +99,7 @@ class MotionWriter(SourceWriter[MotionSource]):
         ConfigurationError: no region may have any.
     """
 
-    kind = NAME
+    form = _FORM
 
     def __init__(
         self,
@@ -141,7 +115,7 @@ class MotionWriter(SourceWriter[MotionSource]):
         self._index = regions.of(SkinLayout((driver,), (structure,)), type_name)
         if not self._index:
             raise ConfigurationError(f"no region is of {type_name} sensors")
-        source = MotionSource(driver, type_name, structure.type(type_name).unit, frames, tuple(self._index))
+        source = Source(driver, type_name, structure.type(type_name).unit, frames, tuple(self._index))
         super().__init__(source, name, f"motion over regions of {driver or 'a skin'}, {type_name}", **options)
 
     def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:

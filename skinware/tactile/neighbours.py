@@ -111,7 +111,16 @@ def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
     for number in np.unique(frame):
         of_frame = rows[frame == number]
         places, first = np.unique(geometry.position_m[of_frame], axis=0, return_index=True)
-        pitch[of_frame] = _median_distance(places, geometry.normal[of_frame[first]])
+        normal = geometry.normal[of_frame[first]]
+        sample = np.unique(np.linspace(0, len(places) - 1, _PITCH_SAMPLE).astype(np.int64))
+        squares = np.zeros((len(sample), len(places)))
+        for axis in range(3):
+            squares += (places[sample, axis, None] - places[None, :, axis]) ** 2
+        squares[np.arange(len(sample)), sample] = np.inf
+        squares[normal[sample] @ normal.T < _OPPOSITE] = np.inf
+        nearest = squares.min(axis=1)
+        if np.isfinite(nearest).any():
+            pitch[of_frame] = np.sqrt(np.median(nearest[np.isfinite(nearest)]))
     return pitch
 
 
@@ -162,18 +171,6 @@ def _on_one_side(
     """The pairs that do not lie on opposite sides of a part, as far as their normals are known."""
     opposite = np.einsum("ij,ij->i", normal[one], normal[other]) < _OPPOSITE
     return one[~opposite], other[~opposite]
-
-
-def _median_distance(places: npt.NDArray[np.float64], normal: npt.NDArray[np.float64]) -> float:
-    """The median distance from a place to the nearest other on its side, m, of a sample; NaN if there is none."""
-    sample = np.unique(np.linspace(0, len(places) - 1, _PITCH_SAMPLE).astype(np.int64))
-    squares = np.zeros((len(sample), len(places)))
-    for axis in range(3):
-        squares += (places[sample, axis, None] - places[None, :, axis]) ** 2
-    squares[np.arange(len(sample)), sample] = np.inf
-    squares[normal[sample] @ normal.T < _OPPOSITE] = np.inf
-    nearest = squares.min(axis=1)
-    return float(np.sqrt(np.median(nearest[np.isfinite(nearest)]))) if np.isfinite(nearest).any() else np.nan
 
 
 def _pairs_within_1(

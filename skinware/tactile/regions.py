@@ -226,23 +226,19 @@ class SensorChoice:
             driver: name of the driver.
             structure: structure of the driver.
         """
-        wanted = np.zeros(structure.n_sensors, bool)
-        for sensor_type in structure.types:
-            if not self.types or sensor_type.name in self.types:
-                wanted[structure.index(sensor_type.name)] = self._in_regions(driver, structure, sensor_type.name)
+        wanted, layout = np.zeros(structure.n_sensors, bool), SkinLayout((driver,), (structure,))
+        for name in [each.name for each in structure.types if not self.types or each.name in self.types]:
+            inside = np.full(len(structure.module_of(name)), not self.in_regions)
+            if self.in_regions and len(inside):
+                found = self.regions.of(layout, name)
+                for region in self.in_regions:
+                    if region in found:  # others are of sensors of other types
+                        inside[found[region]] = True
+            wanted[structure.index(name)] = inside
         if self.patches:
             numbers = [row for row, name in enumerate(structure.patch_names) if name in self.patches]
             wanted &= np.isin(structure.sensor_patch, numbers)
         return wanted
-
-    def _in_regions(self, driver: str, structure: Structure, type_name: str) -> Flags:
-        inside = np.full(len(structure.module_of(type_name)), not self.in_regions)
-        if self.in_regions and len(inside):
-            found = self.regions.of(SkinLayout((driver,), (structure,)), type_name)
-            for name in self.in_regions:
-                if name in found:  # others are of sensors of other types
-                    inside[found[name]] = True
-        return inside
 
 
 def unknown(what: str, wanted: Collection[str], there_are: Sequence[str]) -> Iterator[str]:

@@ -6,10 +6,9 @@ refuses a service of another form.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, Self, TypedDict, TypeVar, Unpack, cast
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Self, TypedDict, Unpack, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -21,9 +20,6 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
 from skinware.service import Column, ServiceReader, ServiceWriter
 
-Static = Mapping[str, npt.NDArray[Any]]
-SourceT = TypeVar("SourceT", bound="Source")
-
 
 class ServiceOptions(TypedDict, total=False):
     """Options of :class:`skinware.service.ServiceWriter` that every writer takes."""
@@ -34,82 +30,109 @@ class ServiceOptions(TypedDict, total=False):
     group: str | None
 
 
-class Source(ABC):
-    """The description of a service."""
-
-    @classmethod
-    @abstractmethod
-    def read(cls, static: Static) -> Self:
-        """Read it from static columns; raises LookupError, ValueError or TypeError if they are of another form."""
-
-    @abstractmethod
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the static columns."""
-
-    @abstractmethod
-    def columns(self) -> dict[str, Column]:
-        """Return the columns of a sample."""
+_STATIC = {
+    "driver": ("driver", "S64"),
+    "type_name": ("type_name", "S32"),
+    "unit": ("type_unit", "S16"),
+    "frames": ("frame_name", "S64"),
+    "regions": ("region_name", "S"),
+    "uid": ("sensor_uid", "<u8"),
+    "type_id": ("sensor_type", "<u4"),
+}
+"""Static column and dtype of each attribute of a source."""
+_LISTS = ("frames", "regions")
 
 
-@dataclass(frozen=True)
-class ValueSource(Source):
-    """The values that a service is computed from.
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The values that a service is computed from; each kind of service has some of these attributes.
 
     Attributes:
         driver: name of the driver of the values.
         type_name: sensor type of the values.
         unit: unit of values and loads.
         frames: names of the coordinate frames.
+        regions: names of the regions.
+        uid: (n,) uint64, of the n sensors, in the order of the values.
+        type_id: (n,) uint32, of their types.
     """
 
     driver: str
-    type_name: str
-    unit: str
-    frames: tuple[str, ...]
-
-    @staticmethod
-    def values(static: Static) -> dict[str, Any]:
-        """Return the attributes above from static columns."""
-        return {
-            "driver": texts(static["driver"])[0],
-            "type_name": texts(static["type_name"])[0],
-            "unit": texts(static["type_unit"])[0],
-            "frames": tuple(texts(static["frame_name"])),
-        }
-
-    def static(self) -> dict[str, npt.NDArray[Any]]:
-        """Return the static columns of the attributes above."""
-        return {
-            "frame_name": np.array([name.encode() for name in self.frames], "S64"),
-            "driver": np.array([self.driver.encode()], "S64"),
-            "type_name": np.array([self.type_name.encode()], "S32"),
-            "type_unit": np.array([self.unit.encode()], "S16"),
-        }
+    type_name: str = ""
+    unit: str = ""
+    frames: tuple[str, ...] = ()
+    regions: tuple[str, ...] = ()
+    uid: npt.NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
+    type_id: npt.NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
 
 
-class SourceWriter(Generic[SourceT]):
+@dataclass(frozen=True)
+class ServiceForm:
+    """The form of one kind of service.
+
+    Attributes:
+        kind: its name, and the usual name of such a service.
+        attributes: those that its source has, each in a static column.
+        about: unit of each column of a sample, None for that of the values; and its meaning.
+        columns_of: dtype and shape of each column of a sample, by the source.
+    """
+
+    kind: str
+    attributes: tuple[str, ...]
+    about: Mapping[str, tuple[str | None, str]]
+    columns_of: Callable[[Source], Mapping[str, tuple[str, tuple[int, ...]]]]
+
+    def read(self, static: Mapping[str, npt.NDArray[Any]]) -> Source:
+        """Return the source in static columns; raises LookupError, ValueError or TypeError at another form."""
+        found: dict[str, Any] = {}
+        for name in self.attributes:
+            column, dtype = _STATIC[name]
+            if dtype.startswith("S"):
+                names = tuple(texts(static[column]))
+                found[name] = names if name in _LISTS else names[0]
+            else:
+                found[name] = static[column].astype(dtype)
+        source = Source(**found)
+        if "type_id" in found and source.uid.shape != source.type_id.shape:
+            raise ValueError(f"{len(source.uid)} uids of {len(source.type_id)} types")
+        return source
+
+    def columns(self, source: Source) -> tuple[dict[str, Column], dict[str, npt.NDArray[Any]]]:
+        """Return the columns of a sample, and the static columns."""
+        columns, static = {}, {}
+        for name, (dtype, shape) in self.columns_of(source).items():
+            unit, text = self.about[name]
+            columns[name] = Column(np.dtype(dtype), shape, source.unit if unit is None else unit, text)
+        for name in self.attributes:
+            (column, dtype), value = _STATIC[name], getattr(source, name)
+            if dtype.startswith("S"):
+                value = [each.encode() for each in (value if name in _LISTS else [value])]
+            static[column] = np.array(value, dtype)
+        return columns, static
+
+
+class SourceWriter:
     """Publishes a service of one kind.
 
     Attributes:
-        kind: kind of the service.
+        form: of the service.
         source: the present source of the service.
     """
 
-    kind: ClassVar[str]
+    form: ClassVar[ServiceForm]
 
-    def __init__(self, source: SourceT, name: str, description: str, **options: Unpack[ServiceOptions]) -> None:
-        self.source: SourceT = source
-        self._service = ServiceWriter(
-            name, source.columns(), source.static(), kind=self.kind, description=description, **options
-        )
+    def __init__(self, source: Source, name: str, description: str, **options: Unpack[ServiceOptions]) -> None:
+        self.source = source
+        columns = self.form.columns(source)
+        self._service = ServiceWriter(name, *columns, kind=self.form.kind, description=description, **options)
 
     @property
     def name(self) -> str:
         """Name of the service."""
         return self._service.name
 
-    def _restructure(self, source: SourceT) -> None:
-        self._service.restructure(source.columns(), source.static())
+    def _restructure(self, source: Source) -> None:
+        self._service.restructure(*self.form.columns(source))
         self.source = source
 
     def close(self) -> None:
@@ -123,18 +146,18 @@ class SourceWriter(Generic[SourceT]):
         self.close()
 
 
-class SourceSample(Sample, Generic[SourceT]):
+class SourceSample(Sample):
     """A sample of a service that has a source."""
 
     __slots__ = ()
 
     @property
-    def source(self) -> SourceT:
+    def source(self) -> Source:
         """The source of the service."""
-        return cast(SourceT, self.context)
+        return cast(Source, self.context)
 
 
-class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
+class SourceReader(ServiceReader[SampleT]):
     """Reads a service of one kind.
 
     Args:
@@ -142,15 +165,13 @@ class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
         namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
 
     Attributes:
-        kind: kind of the service.
-        source_class: class of its source.
+        form: of the service.
 
     Raises:
         BadServiceFile: the service is of another kind, or its columns are others.
     """
 
-    kind: ClassVar[str]
-    source_class: ClassVar[type[Source]]
+    form: ClassVar[ServiceForm]
 
     def __init__(
         self,
@@ -160,20 +181,20 @@ class SourceReader(ServiceReader[SampleT], Generic[SourceT, SampleT]):
         timeout_s: float | None = 0.0,
         announce: bool = True,
     ) -> None:
-        super().__init__(name or self.kind, namespace=namespace, timeout_s=timeout_s, announce=announce)
+        super().__init__(name or self.form.kind, namespace=namespace, timeout_s=timeout_s, announce=announce)
 
     @property
-    def source(self) -> SourceT:
+    def source(self) -> Source:
         """The source of the service."""
-        return cast(SourceT, self._ring.context)
+        return cast(Source, self._ring.context)
 
     def _describe(self, attached: segments.Segment) -> Source:
-        if bytes(attached.header["kind"]) != self.kind.encode():
-            raise BadServiceFile(f"service {self.name!r} is not of kind {self.kind!r}")
+        if bytes(attached.header["kind"]) != self.form.kind.encode():
+            raise BadServiceFile(f"service {self.name!r} is not of kind {self.form.kind!r}")
         found = attached.schema.columns
         try:
-            source = self.source_class.read(attached.static_columns())
-            for name, column in source.columns().items():
+            source = self.form.read(attached.static_columns())
+            for name, column in self.form.columns(source)[0].items():
                 if found[name].dtype != column.dtype or found[name].shape != column.shape:
                     raise ValueError(f"column {name!r} is not {column.shape} of {column.dtype}")
         except (LookupError, ValueError, TypeError, AttributeError) as error:

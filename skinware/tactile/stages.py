@@ -116,16 +116,20 @@ class Stage(ABC):
 
     Attributes:
         name: its name in files.
-        taxels: the taxels as they come out.
+        axes: the taxels as they come out, for each type that the stage changes together.
+        taxels: those of the first type.
     """
 
     name: ClassVar[str]
-    taxels: Taxels
 
-    @property
-    def axes(self) -> tuple[Taxels, ...]:
-        """The taxels as they come out, for each type that the stage changes together."""
-        return (self.taxels,)
+    def __init__(self, *axes: Taxels) -> None:
+        self.axes, self.taxels = axes, axes[0]
+        self._time_ns: int | None = None
+
+    def _passed_s(self, signal: Signal) -> float:
+        """Return the seconds since the frame before; 0 for the first."""
+        before_ns, self._time_ns = self._time_ns, signal.time_ns
+        return 0.0 if before_ns is None else max(0, signal.time_ns - before_ns) / NS_PER_S
 
     def state(self) -> dict[str, npt.NDArray[np.float64]]:
         """Return what baselines behind it need after a restart: arrays (n,) by name, copies."""
@@ -182,15 +186,12 @@ class Lowpass(Stage):
     name = "filter"
 
     def __init__(self, taxels: Taxels, tau_s: float) -> None:
-        self.taxels = replace(taxels, resolution=0.0)
+        super().__init__(replace(taxels, resolution=0.0))
         self._tau_s = tau_s
-        self._time_ns: int | None = None
         self._smooth: Floats = np.full(len(taxels), np.nan, np.float32)
 
     def step(self, signal: Signal) -> None:
-        passed_s = 0 if self._time_ns is None else max(0, signal.time_ns - self._time_ns) / NS_PER_S
-        self._time_ns = signal.time_ns
-        share = np.float32(-math.expm1(-passed_s / self._tau_s))
+        share = np.float32(-math.expm1(-self._passed_s(signal) / self._tau_s))
         np.copyto(self._smooth, signal.values, where=signal.usable & np.isnan(self._smooth))
         self._smooth += np.where(signal.usable, signal.values - self._smooth, np.float32(0)) * share
         signal.values = np.where(np.isnan(self._smooth), signal.values, self._smooth)
@@ -202,7 +203,7 @@ class LastFrames(Stage):
     name = "filter"
 
     def __init__(self, taxels: Taxels, frames: int, method: Literal["mean", "median"]) -> None:
-        self.taxels = replace(taxels, resolution=0.0)
+        super().__init__(replace(taxels, resolution=0.0))
         self._median = method == "median"
         self._last: Floats = np.full((frames, len(taxels)), np.nan, np.float32)
 
@@ -260,9 +261,8 @@ class Scaler(Stage):
     def __init__(self, taxels: Taxels, settings: ScalerSettings) -> None:
         before = taxels.type
         scaled = replace(before, unit=NO_UNIT, minimum=settings.low, maximum=settings.high)
-        self.taxels = replace(taxels, type=scaled, resolution=0.0)
+        super().__init__(replace(taxels, type=scaled, resolution=0.0))
         self._settings = settings
-        self._time_ns: int | None = None
         is_range = settings.source == "range"
         self._least: Floats = np.full(len(taxels), before.minimum if is_range else np.nan, np.float32)
         self._most: Floats = np.full(len(taxels), before.maximum if is_range else np.nan, np.float32)
@@ -271,13 +271,12 @@ class Scaler(Stage):
         settings = self._settings
         if settings.source == "seen":
             seen = np.where(signal.usable, signal.values, np.float32(np.nan))
-            if settings.shrink_s is not None and self._time_ns is not None:
-                share = np.float32(-math.expm1(-max(0, signal.time_ns - self._time_ns) / NS_PER_S / settings.shrink_s))
+            if settings.shrink_s is not None:
+                share = np.float32(-math.expm1(-self._passed_s(signal) / settings.shrink_s))
                 here = np.where(signal.usable, share, np.float32(0))
                 self._least += np.where(signal.usable, seen - self._least, np.float32(0)) * here
                 self._most += np.where(signal.usable, seen - self._most, np.float32(0)) * here
             self._least, self._most = np.fmin(self._least, seen), np.fmax(self._most, seen)
-            self._time_ns = signal.time_ns
         span = self._most - self._least
         share = np.divide(signal.values - self._least, span, out=np.zeros_like(span), where=span > 0)
         signal.values = (settings.low + (settings.high - settings.low) * np.clip(share, 0, 1)).astype(np.float32)
@@ -319,7 +318,7 @@ class Amplifier(Stage):
         ends = self._of(np.array([taxels.type.minimum, taxels.type.maximum]))
         amplified = replace(taxels.type, unit=settings.unit, minimum=float(ends.min()), maximum=float(ends.max()))
         step = taxels.resolution * abs(settings.gain) if settings.exponent == 1 else 0.0
-        self.taxels = replace(taxels, type=amplified, resolution=step)
+        super().__init__(replace(taxels, type=amplified, resolution=step))
 
     def step(self, signal: Signal) -> None:
         signal.values = self._of(signal.values).astype(np.float32)

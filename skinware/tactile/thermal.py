@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
 from skinware.tactile.curves import TEMPERATURE
 from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxels
 
@@ -85,7 +83,10 @@ class ThermalGains:
         self.variance = np.minimum(self.variance + self._spread2 * WINDOW_S / GAIN_LASTS_S, self._spread2)
         found = np.where(known, change - self.own * warmed, 0.0)
         warmed = np.where(known, warmed, 0.0)
-        self._find_noise(found**2, known)
+        for patch in np.unique(self._patch[known]).tolist():  # surprises of most taxels of a patch show its noise
+            noise2 = np.median(found[known & (self._patch == patch)] ** 2) / _MEDIAN2
+            before = noise2 if np.isnan(self._noise2[patch]) else self._noise2[patch]
+            self._noise2[patch] = before + 0.3 * (noise2 - before)
         noise2 = self._noise2[self._patch] * self._noisier + 1e-12
         total = self.variance * warmed**2 + np.where(known, noise2, 1.0)
         share = self.variance * warmed / total
@@ -102,24 +103,6 @@ class ThermalGains:
         typical = np.bincount(self._patch, self.own) / np.maximum(certain, 1e-9)
         self.gain = self.own + unknown * typical[self._patch]
 
-    def _find_noise(self, found2: npt.NDArray[np.float64], known: npt.NDArray[np.bool_]) -> None:
-        """Take the squares of (n,) surprises in; those of most taxels of a patch show its noise."""
-        for patch in np.unique(self._patch[known]).tolist():
-            noise2 = np.median(found2[known & (self._patch == patch)]) / _MEDIAN2
-            before = noise2 if np.isnan(self._noise2[patch]) else self._noise2[patch]
-            self._noise2[patch] = before + 0.3 * (noise2 - before)
-
-
-@dataclass(eq=False)
-class _Window:
-    """Sums over a window of time: of the values of n taxels, of the temperatures of modules, and their numbers."""
-
-    values: npt.NDArray[np.float64]
-    counts: npt.NDArray[np.int64]
-    warmth: npt.NDArray[np.float64]
-    frames: int = 0
-    passed_s: float = 0.0
-
 
 class ThermalStage(Stage):
     """Takes what temperatures have changed since its first frame off the values of n taxels.
@@ -131,22 +114,15 @@ class ThermalStage(Stage):
     name = "thermal"
 
     def __init__(self, taxels: Taxels, pads: Taxels, spread: float) -> None:
-        self.taxels = taxels
+        super().__init__(taxels, pads)
         self._pads = pads
         self.gains = ThermalGains(taxels.patch, spread)
         self._n_modules = int(max(taxels.module.max(initial=-1), pads.module.max(initial=-1))) + 1
         self._warmth = np.full(self._n_modules, np.nan)
         self._drift = np.zeros(len(taxels))
-        self._time_ns: int | None = None
-        self._begin_window()
-
-    def _begin_window(self) -> None:
-        n = len(self.taxels)
-        self._window = _Window(np.zeros(n), np.zeros(n, np.int64), np.zeros(self._n_modules))
-
-    @property
-    def axes(self) -> tuple[Taxels, ...]:
-        return self.taxels, self._pads
+        self._sums, self._warmth_sums = np.zeros((2, len(taxels))), np.zeros(self._n_modules)
+        """Over a window of time: of the values of taxels and their numbers, and of the temperatures of modules."""
+        self._frames, self._window_s = 0, 0.0
 
     def state(self) -> dict[str, npt.NDArray[np.float64]]:
         warmth = self._warmth[self.taxels.module]
@@ -168,9 +144,7 @@ class ThermalStage(Stage):
 
     def step(self, signal: Signal, *others: Signal) -> None:
         (pads,) = others
-        is_first = self._time_ns is None
-        passed_s = 0.0 if self._time_ns is None else max(0, signal.time_ns - self._time_ns) / NS_PER_S
-        self._time_ns = signal.time_ns
+        is_first, passed_s = self._time_ns is None, self._passed_s(signal)
         self._follow(pads, 1.0 if is_first else -math.expm1(-passed_s / SMOOTH_S))
         self._collect(signal, passed_s)
         limits = self.taxels.type
@@ -188,14 +162,14 @@ class ThermalStage(Stage):
         self._drift += self.gains.gain * np.nan_to_num(change)[self.taxels.module]
 
     def _collect(self, signal: Signal, passed_s: float) -> None:
-        window = self._window
-        window.values += np.where(signal.usable, signal.values, np.float32(0))
-        window.counts += signal.usable
-        window.warmth += self._warmth
-        window.frames += 1
-        window.passed_s += passed_s
-        if window.passed_s < WINDOW_S:
+        self._sums += np.where(signal.usable, signal.values, np.float32(0)), signal.usable
+        self._warmth_sums += self._warmth
+        self._frames += 1
+        self._window_s += passed_s
+        if self._window_s < WINDOW_S:
             return
-        values = np.divide(window.values, window.counts, out=np.full(len(self.taxels), np.nan), where=window.counts > 0)
-        self.gains.learn(values, (window.warmth / window.frames)[self.taxels.module])
-        self._begin_window()
+        values, counts = self._sums
+        means = np.divide(values, counts, out=np.full(len(values), np.nan), where=counts > 0)
+        self.gains.learn(means, (self._warmth_sums / self._frames)[self.taxels.module])
+        self._sums[:], self._warmth_sums[:] = 0, 0
+        self._frames, self._window_s = 0, 0.0

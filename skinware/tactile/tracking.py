@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.assignment import Gains, assign
 from skinware.tactile.meetings import Meetings, fit_bells, resume
 from skinware.tactile.tracks import (
     TRACK,
@@ -18,6 +17,7 @@ from skinware.tactile.tracks import (
     TouchedBlobs,
     Tracks,
     Whole,
+    assign,
     correct,
     expected_at,
     is_shared,
@@ -124,6 +124,9 @@ class Tracker:
         position_m: (n, 3) m, places of the taxels.
         pitch_m: of the taxels, m; NaN if it is not known.
         settings: default: those of the class.
+
+    Attributes:
+        track_of: (n,) int64, the track that each taxel was last in; -1: none.
     """
 
     def __init__(self, position_m: Floats, pitch_m: float, settings: TrackingSettings | None = None) -> None:
@@ -131,16 +134,11 @@ class Tracker:
         self._position_m = position_m
         self._pitch_m = settings.pitch_m or (pitch_m if pitch_m > 0 else _PITCH_M)
         self._tracks: Tracks = np.zeros(0, TRACK)
-        self._track_of = np.full(len(position_m), -1, np.int64)
+        self.track_of: Whole = np.full(len(position_m), -1, np.int64)
         self._taxels = np.zeros(0, np.int64)  # that have a track
         self._meetings = Meetings(self._pitch_m)
         self._last_id = self._last_key = 0
         self._time_ns: int | None = None
-
-    @property
-    def track_of(self) -> Whole:
-        """(n,) the track that each taxel was last in; -1: none."""
-        return self._track_of
 
     def rests(self, time_ns: int) -> bool:
         """Take a frame without blobs, if no contact is followed; return whether that is so."""
@@ -156,7 +154,10 @@ class Tracker:
         if not len(before) and not len(size):
             return _NOTHING
         expected = expected_at(before, time_ns)
-        overlap = self._overlap(blobs, size)
+        track = self.track_of[blobs.taxels]
+        pair = track[track >= 0] * len(size) + blobs.blob[track >= 0]
+        shared = np.bincount(pair, minlength=len(before) * len(size)).reshape(len(before), len(size))
+        overlap = shared / np.maximum(np.minimum(before["size"][:, None], size), 1)  # as a share of the smaller one
         home = self._homes(overlap, expected, blobs, size)
         self._meetings.begin(before, expected["place"], time_ns)
         is_joined = overlap >= 0.5
@@ -184,16 +185,7 @@ class Tracker:
         if not keep.all():
             number = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)
             self._tracks = tracks[keep]
-            self._track_of[self._taxels] = number[self._track_of[self._taxels]]
-
-    def _overlap(self, blobs: TouchedBlobs, size: Whole) -> Floats:
-        """(tracks, m): shared taxels of each pair, as a share of the smaller one."""
-        tracks, track = self._tracks, self._track_of[blobs.taxels]
-        is_known = track >= 0
-        pair = track[is_known] * len(size) + blobs.blob[is_known]
-        shared = np.bincount(pair, minlength=len(tracks) * len(size)).reshape(len(tracks), len(size))
-        overlap: Floats = shared / np.maximum(np.minimum(tracks["size"][:, None], size), 1)
-        return overlap
+            self.track_of[self._taxels] = number[self.track_of[self._taxels]]
 
     def _homes(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> Whole:
         """(tracks,) the blob of each; -1: it has gone."""
@@ -209,7 +201,7 @@ class Tracker:
         self._join(home, overlap, expected, blobs, size)
         return home
 
-    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Gains:
+    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Floats:
         """(tracks, m): the gain of each pair; 0: they cannot be the same."""
         tracks = self._tracks
         away = expected["place"][:, None] - blobs.cop_m
@@ -359,12 +351,12 @@ class Tracker:
             bell = np.log(tracks["height"][shared]) - (away**2).sum(axis=2) / (2 * tracks["width"][shared] ** 2)
             bell[blobs.blob[within, None] != tracks["home"][shared]] = -np.inf
             of_taxel[within] = shared[bell.argmax(axis=1)]
-        track = self._track_of[self._taxels]
+        track = self.track_of[self._taxels]
         left = self._taxels[(track >= 0) & is_gone[track]] if len(is_gone) else self._taxels[:0]
-        left_by = self._track_of[left]
-        self._track_of[self._taxels] = -1
-        self._track_of[left] = left_by
-        self._track_of[blobs.taxels] = of_taxel
+        left_by = self.track_of[left]
+        self.track_of[self._taxels] = -1
+        self.track_of[left] = left_by
+        self.track_of[blobs.taxels] = of_taxel
         self._taxels = np.concatenate([left, blobs.taxels])
         self._tracks = tracks
 

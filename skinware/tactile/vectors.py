@@ -18,7 +18,6 @@ import numpy.typing as npt
 from skinware import native
 from skinware.errors import ConfigurationError
 from skinware.native import give_arrays, read_structs
-from skinware.realtime import NS_PER_S
 from skinware.tactile.rule import FORGET_AFTER_S
 from skinware.tactile.stages import Floats, Positive, Signal, Stage, StageSettings, Taxels
 
@@ -139,24 +138,17 @@ class FieldStage(Stage):
 
     def __init__(self, axes: tuple[Taxels, ...], spread: float) -> None:
         spans = [one.type.maximum - one.type.minimum for one in axes]
-        self._axes = tuple(
+        of_both_signs = (
             replace(one, type=replace(one.type, minimum=-span, maximum=span), resolution=0.0, signed=True, common=False)
             for one, span in zip(axes, spans, strict=True)
         )
-        self.taxels = self._axes[0]
+        super().__init__(*of_both_signs)
         self.field = ArrayField(axes[0].patch, spread)
-        self._time_ns: int | None = None
-
-    @property
-    def axes(self) -> tuple[Taxels, ...]:
-        return self._axes
 
     def step(self, signal: Signal, *others: Signal) -> None:
         signals = (signal, *others)
-        passed_s = 0 if self._time_ns is None else max(0, signal.time_ns - self._time_ns) / NS_PER_S
-        self._time_ns = signal.time_ns
         usable = np.logical_and.reduce([one.usable for one in signals])
-        rest, sure = self.field.update(np.array([one.values for one in signals]), usable, passed_s)
+        rest, sure = self.field.update(np.array([one.values for one in signals]), usable, self._passed_s(signal))
         for one, values in zip(signals, rest, strict=True):
             one.values, one.usable, one.bears = values, sure, self.field.bears
 
@@ -166,21 +158,13 @@ class VectorSettings(StageSettings, frozen=True, kw_only=True, tag="vector"):
 
     def stage(self, *axes: Taxels) -> Stage:
         """Make the stage for the three axes of some taxels."""
-        return VectorStage(axes)
+        return VectorStage(*axes)
 
 
 class VectorStage(Stage):
     """Shows how far all three axes of a taxel are from their baselines where one of them is touched."""
 
     name = "vector"
-
-    def __init__(self, axes: tuple[Taxels, ...]) -> None:
-        self._axes = axes
-        self.taxels = axes[0]
-
-    @property
-    def axes(self) -> tuple[Taxels, ...]:
-        return self._axes
 
     def step(self, signal: Signal, *others: Signal) -> None:
         signals = (signal, *others)

@@ -180,7 +180,7 @@ class Origin:
         motion = [found for source in self._motion if (found := source.of(driver)) is not None]
         return calm, next(iter(contacts), None), next(iter(motion), None)
 
-    def contacts_reader(self, driver: str) -> SourceReader[Any, ContactsSample] | None:
+    def contacts_reader(self, driver: str) -> SourceReader[ContactsSample] | None:
         found = (reader for source in self._contacts for reader in source.readers.values())
         return next((reader for reader in found if reader.source.driver == driver), None)
 

@@ -7,7 +7,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from typing import Any, Generic, NamedTuple
+from typing import Generic, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -147,7 +147,7 @@ class LiveBridges(Drivers[BridgeReader]):
         return [sample.state for sample in samples if sample is not None and not sample.stale]
 
 
-class LiveSources(Drivers[SourceReader[Any, SampleT]], Generic[SampleT]):
+class LiveSources(Drivers[SourceReader[SampleT]], Generic[SampleT]):
     """The services of one kind in a namespace, each of which is about one driver."""
 
     def of(self, driver: str) -> SampleT | None:

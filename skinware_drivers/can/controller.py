@@ -117,13 +117,7 @@ class ControllerHealth:
         self._trouble_until_ns = dict.fromkeys(_TROUBLES, 0)
 
     def take(self, identifier: npt.NDArray[np.uint32], payload: npt.NDArray[np.uint8], time_ns: int) -> None:
-        """Add error frames.
-
-        Args:
-            identifier: (n,) uint32, in order of arrival.
-            payload: (n, 8 or more) uint8.
-            time_ns: now, CLOCK_MONOTONIC ns.
-        """
+        """Add n error frames, in order of arrival; the time is now, CLOCK_MONOTONIC ns."""
         detail = np.where(identifier & _CONTROLLER, payload[:, 1], 0)
         protocol = (identifier & (_PROTOCOL | _BUS_ERROR | _TRANSCEIVER)) != 0
         at_ack = protocol & np.isin(payload[:, 3], (_ACK_SLOT, _ACK_DELIMITER))
@@ -183,12 +177,7 @@ _SWITCHED, _PASSIVE_SENDER, _IS_FD = 0x01, 0x02, 0x04
 
 
 def wire_bits(wire: npt.NDArray[np.void], speed_up: float = 1.0) -> float:
-    """Return about how many bits of the nominal rate frames take.
-
-    Args:
-        wire: (n,) rows of :func:`skinware_drivers.bus.wire_dtype`.
-        speed_up: data rate / nominal rate of CAN FD frames that switch.
-    """
+    """Return about how many bits of the nominal rate frames take; CAN FD frames may switch to a faster one."""
     if wire.dtype["payload"].shape[0] == _CLASSIC_PAYLOAD:
         return _classic_bits(wire)
     length, flags = wire["length"].astype(np.int64), wire["flags"]

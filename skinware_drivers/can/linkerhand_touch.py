@@ -39,10 +39,7 @@ FORCE = PRESSURE.measured(unit="counts", minimum=0, maximum=255)
 class TouchQuestion(NamedTuple):
     """A command that asks for touch.
 
-    Attributes:
-        last: first bytes of the last frame of the reply.
-        shortest: least bytes of that frame: more than other programs' questions have.
-        patience_s: how long to wait for the reply.
+    The last frame of the reply begins with ``last`` and is not shorter than ``shortest``: no program's question is.
     """
 
     payload: bytes

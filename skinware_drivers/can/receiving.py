@@ -170,11 +170,7 @@ class Stamper:
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
     def read(self, control: Stamps) -> Stamps:
-        """Return (n,) int64, CLOCK_MONOTONIC ns: when frames arrived.
-
-        Args:
-            control: (n, 8) int64, their ancillary data, in order of arrival.
-        """
+        """Return (n,) int64, CLOCK_MONOTONIC ns: when the frames of (n, 8) int64 ancillary data arrived, in order."""
         before_ns = self.offset_ns
         self.offset_ns, poll_ns = _offset_now_ns()
         software = control[:, _SOFTWARE_WORD] * NS_PER_S + control[:, _SOFTWARE_WORD + 1]

@@ -44,10 +44,7 @@ _AREA_SHIFTS, _LAST_OF_4E = 0x22, 0x0A
 
 
 class BoardSetUp:
-    """The set-up of one board, and the state it leaves the board in.
-
-    Args:
-        is_mtb4: matters for the old way only.
+    """The set-up of one board, and the state it leaves the board in; ``is_mtb4`` matters for the old way only.
 
     Attributes:
         first: messages for every board, in order; each goes to all boards before the next.
@@ -55,7 +52,6 @@ class BoardSetUp:
         special_triangles: messages after the second wait.
         enabled: triangles that are switched on in the end.
         wiped: triangles that a special board configuration switched off, though no option does.
-        skin_type: as sent to it.
         is_uneven: its triangles have different shifts or converter offsets.
     """
 

@@ -26,7 +26,7 @@ def driver_of_recording(bus_names: Sequence[str]) -> str:
 
 
 def only_listened(bus_names: Sequence[str]) -> bool:
-    """Return whether all buses are replayed, and were recorded by drivers that sent nothing."""
+    """Return whether all buses are replayed, and were recorded by drivers that sent nothing, or are logs of that."""
     found = [_recorded(name) for name in bus_names]
     return bool(found) and all(recorded is not None and recorded.listen_only for recorded in found)
 
@@ -37,7 +37,7 @@ def options_of_recording(bus_name: str, driver_type: str) -> Mapping[str, Any]:
 
 
 def _recorded(bus_name: str) -> Recorded | None:
-    if not bus_name.startswith("replay:"):
+    if not bus_name.startswith(("replay:", "file:")):
         return None
     from skinware_drivers.virtual.recorded import recorded_driver
 

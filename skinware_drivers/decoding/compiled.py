@@ -32,8 +32,7 @@ Indices = npt.NDArray[np.int64]
 class Punctuality:
     """When each kind of frame of each module came last, and how long after the one before.
 
-    Args:
-        period_s: nominal time from one cycle of a module to the next; a module may always be slower.
+    A module may always be slower than its nominal period from cycle to cycle.
     """
 
     def __init__(self, cycle: Cycle, period_s: float, n_modules: int) -> None:
@@ -53,14 +52,9 @@ class Punctuality:
 
 
 class CompiledCycle:
-    """A cycle of one layout.
+    """A cycle of one layout, of the frames with the numbers ``members``.
 
-    Args:
-        members: the numbers of its members among them, in order.
-        period_s: nominal time from one cycle to the next; None: not known.
-
-    Attributes:
-        sequence: the member whose sequence numbers are compared, and their place; None: there are none.
+    ``sequence`` is the member whose sequence numbers are compared, and their place; None: there are none.
     """
 
     def __init__(
@@ -98,11 +92,7 @@ class CompiledCycle:
 
 
 class UpdateMaker(NamedTuple):
-    """A kind of frame by itself, or a cycle: it makes one update.
-
-    Attributes:
-        period_s: nominal time between two of them; None: the driver's.
-    """
+    """A kind of frame by itself, or a cycle: it makes one update, in its own period or (None) the driver's."""
 
     modules: frozenset[int]
     channels: frozenset[int]

@@ -176,13 +176,9 @@ class DeviceStamps:
         self.clocks: dict[int, DeviceClock] = {}
 
     def apply(self, kind: Bytes, module: Indices, payload: Bytes, time_ns: Indices) -> None:
-        """Replace the times at which frames were received by those at which they were stamped.
+        """Replace the times (CLOCK_MONOTONIC ns) at which n frames were received by those at which they were stamped.
 
-        Args:
-            kind: (n,) uint8, kind of each frame.
-            module: (n,) its module; those from ``n_modules`` on are none.
-            payload: (n, size) uint8.
-            time_ns: (n,) int64, CLOCK_MONOTONIC ns, changed in place.
+        Modules from ``n_modules`` on are none.
         """
         if not self.times:
             return

@@ -50,12 +50,7 @@ class FrameKind:
         self.carries: frozenset[int] = frozenset(self.channels[self.channels >= 0].tolist() if to is None else to)
 
     def expand(self, expand: Expand, payload: Bytes, length: Bytes) -> tuple[npt.NDArray[Any], Flags, Indices]:
-        """Return the values of n frames that a function of the driver's author reads.
-
-        Args:
-            expand: the frame's.
-            payload: (n, size) uint8.
-            length: (n,) uint8.
+        """Read n frames, payloads (n, size) uint8, by a function of the driver's author.
 
         Returns:
             (n, width) values; (n, width) bool, which of them the frames have; and the frames for which it raised.

@@ -147,7 +147,7 @@ class DriverLog:
         Args:
             status: (n_sensors,) of the sensors at the end.
             at_ns: time of the end, CLOCK_MONOTONIC.
-            facts: fields that no snapshot has: the name of the driver, its process, its life and restarts.
+            facts: fields that are not in snapshots: the name of the driver, its process, its life and restarts.
         """
         statuses, affected = self._affected(status)
         suspect = (self._always & np.uint8(Status.SUSPECT)) != 0

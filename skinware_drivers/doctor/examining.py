@@ -43,8 +43,19 @@ class Examination:
 
 
 def examine(evidence: Evidence) -> Examination:
-    """Run all checks on what was seen."""
-    notes = [_finished(note, area, evidence) for area, check in CHECKS.items() for note in check(evidence)]
+    """Run all checks on what was seen; texts become printable, and commands that are of no use are left out."""
+    notes: list[Note] = []
+    elsewhere = evidence.namespace if evidence.namespace not in ("", Namespace().name) else ""
+    for area, check in CHECKS.items():
+        for note in check(evidence):
+            texts: dict[str, Any] = {k: printable(value) for k, value in vars(note).items() if isinstance(value, str)}
+            if not isinstance(note, Looked):
+                texts["commands"] = tuple(
+                    printable(_in_namespace(command, elsewhere))
+                    for command in note.commands
+                    if evidence.is_live or command.startswith(_OF_ANY_TIME)
+                )
+            notes.append(replace(note, **{**texts, "area": area}))
     return Examination(
         tuple(sorted((note for note in notes if isinstance(note, Finding)), key=lambda one: -one.severity)),
         tuple(note for note in notes if isinstance(note, Looked)),
@@ -52,19 +63,8 @@ def examine(evidence: Evidence) -> Examination:
     )
 
 
-def _finished(note: Note, area: str, evidence: Evidence) -> Note:
-    """Return a note with its area, printable texts, and the commands that are of use.
-
-    Commands reach the namespace that was examined, even if it is not the default here.
-    """
-    texts: dict[str, Any] = {name: printable(value) for name, value in vars(note).items() if isinstance(value, str)}
-    elsewhere = evidence.namespace if evidence.namespace not in ("", Namespace().name) else ""
-    if not isinstance(note, Looked):
-        commands = []
-        for command in note.commands:
-            if evidence.is_live or command.startswith(_OF_ANY_TIME):
-                if elsewhere and "--namespace" not in command and command.startswith(_FOLLOWS_NAMESPACE):
-                    command = f"{command} --namespace {shlex.quote(elsewhere)}"
-                commands.append(printable(command))
-        texts["commands"] = tuple(commands)
-    return replace(note, **{**texts, "area": area})
+def _in_namespace(command: str, elsewhere: str) -> str:
+    """Return a command that reaches the namespace that was examined, if it is not the default here."""
+    if not elsewhere or "--namespace" in command or not command.startswith(_FOLLOWS_NAMESPACE):
+        return command
+    return f"{command} --namespace {shlex.quote(elsewhere)}"

@@ -92,7 +92,9 @@ def names_of_bus(bus_name: str) -> dict[str, str]:
     interface, channel, options = BusName.of(bus_name).place
     address, _, query = bus_name.partition("?")
     placing = "&".join(part for part in query.split("&") if part.partition("=")[0] in dict(options))
-    names = {} if interface in ("virtual", "replay") else {"name": f"{address}?{placing}" if placing else address}
+    names = (
+        {} if interface in ("virtual", "replay", "file") else {"name": f"{address}?{placing}" if placing else address}
+    )
     return names | ({"channel": channel} if interface == "socketcan" else {})
 
 

@@ -177,7 +177,9 @@ def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAd
                 driver
                 for driver, kind in drivers.items()
                 if any(
-                    (one.name, one.dds_type) == (heard.topic, heard.type_name) for one in getattr(kind, "topics", ())
+                    one.dds_type == heard.type_name
+                    and (one.name == heard.topic or getattr(kind, "reads_any_name", False))
+                    for one in getattr(kind, "topics", ())
                 )
             ),
         )

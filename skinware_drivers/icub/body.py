@@ -40,13 +40,7 @@ Pose = tuple[Triple, Triple | None]
 
 @dataclass(frozen=True)
 class Positions:
-    """A position file.
-
-    Attributes:
-        frame: the link with the coordinate frame of the numbers.
-        tactile: by channel, whether it is a taxel.
-        poses: by channel, in metres; None: the file has no place.
-    """
+    """A position file: by channel, whether it is a taxel, and its place in the frame of a link; None: it has none."""
 
     path: Path
     frame: str
@@ -164,11 +158,7 @@ _NOT_USED = ("cardid", "CanDeviceName", "CanDeviceNum", "width", "height", "xpos
 
 @dataclass
 class Drawing:
-    """A drawing of skinGui.
-
-    Attributes:
-        shapes: kinds of triangles, by number (16 per board, in the count of the body part); None: unknown.
-    """
+    """A drawing of skinGui: kinds of triangles by number (16 a board, as the body part counts); None: unknown."""
 
     path: Path
     part: str
@@ -232,12 +222,9 @@ Place = tuple[int, int, int]
 
 @dataclass
 class Body:
-    """The kinds and places of a part's triangles.
+    """The kinds and places of a part's triangles; the uids of places lack the bus.
 
-    Attributes:
-        bare: triangles without a taxel.
-        drawn: triangles in a drawing, by name of the body part; only for parts without positions.
-        groups: places of sensors, by triangle; their uid lack the bus.
+    ``bare`` triangles have no taxel; ``drawn`` ones are in the drawing of a body part that has no positions.
     """
 
     shapes: dict[Place, Shape] = field(default_factory=dict)
@@ -368,12 +355,7 @@ def places_text(places: Sequence[Place] | set[Place]) -> str:
 def regions_of(
     driver: str, places: Mapping[str, set[Place]], enabled: set[Place], patches: Sequence[int]
 ) -> list[Region]:
-    """Return a region for each body part with a triangle that is switched on.
-
-    Args:
-        places: the triangles of each body part, by its name.
-        patches: the device's patches, in the order of the driver's buses.
-    """
+    """Return a region for each body part with a triangle that is on; patches are in the order of the driver's buses."""
     boards = Counter(board for _, board in {(patch, board) for patch, board, _ in enabled})
     regions = []
     for name, of_part in places.items():

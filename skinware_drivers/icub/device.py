@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.icub.xml_tree import Element, Notes, ValueReader, read_xml, words
+from skinware_drivers.icub.xml_tree import Element, Notes, read_xml, words
 
 _MOST_INCLUDES = 200
 _LONGEST_CHAIN = 8
@@ -20,12 +20,7 @@ _FILES_OF_THE_ROBOT = ("general.xml", "pc104.xml", "-eln.xml")
 
 @dataclass
 class Group:
-    """Named parameters, groups and lists.
-
-    Attributes:
-        lists: by name, the elements ``elem`` of each.
-        others: elements that do not belong in a device.
-    """
+    """Named parameters, groups, and lists of elements ``elem``; ``others`` do not belong in a device."""
 
     element: Element
     params: dict[str, Element] = field(default_factory=dict)
@@ -175,12 +170,7 @@ _UNUSED = {
 
 @dataclass(frozen=True)
 class PortRange:
-    """A body part in a skin device's index.
-
-    Attributes:
-        first, last: indices of its first and last value in the device.
-        local_first: index of its first value in the body part, as position files count.
-    """
+    """A body part in a skin device's index; ``local_first`` is its first index as position files count."""
 
     name: str
     element: Element
@@ -202,8 +192,7 @@ class Wrapper:
 def read_wrapper(group: Group) -> Wrapper:
     """Read a wrapper; note values that make no sense."""
     notes = Notes()
-    reader = ValueReader(notes)
-    ports = [port for element in group.lists.get("ports", ()) if (port := _port(element, reader)) is not None]
+    ports = [port for element in group.lists.get("ports", ()) if (port := _port(element, notes)) is not None]
     if not ports:
         notes.at(group.element, "missing", "no usable port in a paramlist 'ports'")
     networks = group.lists.get("networks", [])
@@ -227,15 +216,15 @@ def read_wrapper(group: Group) -> Wrapper:
     return Wrapper(group.element, names[0] if names else "", tuple(ports), notes)
 
 
-def _port(element: Element, reader: ValueReader) -> PortRange | None:
-    row = reader.numbers(element)
+def _port(element: Element, notes: Notes) -> PortRange | None:
+    row = notes.numbers(element)
     if row is None:
         return None
     if len(row) != 4:
-        reader.refuse(element, f"{len(row)} numbers, not 4 (wholeStart wholeEnd localStart localEnd)")
+        notes.refuse(element, f"{len(row)} numbers, not 4 (wholeStart wholeEnd localStart localEnd)")
         return None
     first, last, local_first, local_last = row
     if not 0 <= first <= last < _LARGEST_INDEX or local_first < 0 or last - first != local_last - local_first:
-        reader.refuse(element, f"{element.text!r}: the two ranges differ in length")
+        notes.refuse(element, f"{element.text!r}: the two ranges differ in length")
         return None
     return PortRange(element.name, element, first, last, local_first)

@@ -51,8 +51,6 @@ class ImportedPart:
 
     Attributes:
         name: of the skin; a name that a service can have.
-        ports: body parts in its index.
-        buses: in the order of the configuration.
         groups: places of its sensors, with those that are switched off.
         placed: number of sensors that are switched on and have a place.
     """

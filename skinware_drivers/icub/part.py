@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from skinware_drivers.can.roboskin_options import FIRST_BOARD, LAST_BOARD, TRIANGLES
 from skinware_drivers.icub.device import Group
-from skinware_drivers.icub.xml_tree import Element, Notes, ValueReader, words
+from skinware_drivers.icub.xml_tree import Element, Notes, words
 
 ETHERNET, CAN = "embObjSkin", "canBusSkin"
 _ONLY_PATCH = 1
@@ -54,14 +54,10 @@ class DevicePart:
     """A skin device.
 
     Attributes:
-        name: of the device.
-        element: of the device.
         device_type: one of ``DEVICE_TYPES``.
         boards: addresses by patch, in the files' order; a patch is what we call a bus.
         bus_name: of the CAN bus, if the files name it.
         period_ms, skin_type, no_load, enabled, shift, cdc_offset: of boards and triangles without a set of their own.
-        board_sets: boards that differ.
-        triangle_sets: triangles that differ.
         old: the parameters ``4C_*`` and ``4E_*`` of each board, if the files have no other set-up.
     """
 
@@ -86,11 +82,11 @@ class DevicePart:
         return [(patch, board) for patch in sorted(self.boards, reverse=True) for board in self.boards[patch]]
 
 
-class PartReader(ValueReader):
+class PartReader:
     """Read a skin device; note values that make no sense."""
 
     def __init__(self, name: str, device_type: str, group: Group, notes: Notes) -> None:
-        super().__init__(notes)
+        self.notes = notes
         self._group = group
         self._part = DevicePart(name, group.element, device_type)
         self._can_device: int | None = None
@@ -124,7 +120,7 @@ class PartReader(ValueReader):
         if self._part.device_type == CAN:
             params = self._group.params
             self._take_boards(_ONLY_PATCH, params.get("skinCanIds"), "skinCanIds")
-            self._can_device = self.number(params.get("canDeviceNum"), 0, 99)
+            self._can_device = self.notes.number(params.get("canDeviceNum"), 0, 99)
             kinds = [words(params[name].text) for name in ("canbusDevice", "physDevice") if name in params]
             for name in ("canbusDevice", "physDevice"):
                 if name in params:
@@ -143,7 +139,7 @@ class PartReader(ValueReader):
             self.notes.at(self._part.element, "missing", f"no {_PATCH_PARAMETER}1 or 2 in a group 'patches': no board")
 
     def _take_boards(self, patch: int, element: Element | None, name: str) -> None:
-        found = self.numbers(element)
+        found = self.notes.numbers(element)
         if element is None:
             self.notes.at(self._part.element, "missing", f"no {name}: no board")
         if element is None or found is None:
@@ -151,9 +147,9 @@ class PartReader(ValueReader):
         boards: list[int] = []
         for board in found:
             if not FIRST_BOARD <= board <= LAST_BOARD:
-                self.refuse(element, f"address {board}: boards have {FIRST_BOARD} to {LAST_BOARD}")
+                self.notes.refuse(element, f"address {board}: boards have {FIRST_BOARD} to {LAST_BOARD}")
             elif board in boards:
-                self.refuse(element, f"board {board} is there twice")
+                self.notes.refuse(element, f"board {board} is there twice")
             else:
                 boards.append(board)
         if boards:
@@ -172,7 +168,7 @@ class PartReader(ValueReader):
         if "diagnostic" in board:
             self._unused(board["diagnostic"], "whether the robot's software logs faults; Skinware always shows them")
         triangle = self._params_of("defaultCfgTriangle")
-        enabled = self.truth(triangle.get("enabled"))
+        enabled = self.notes.truth(triangle.get("enabled"))
         if enabled is None:
             self._assume("enabled", part.enabled)
         else:
@@ -188,7 +184,7 @@ class PartReader(ValueReader):
         return group.params
 
     def _default(self, params: dict[str, Element], name: str, default: int, first: int = 0) -> int:
-        found = self.number(params.get(name), first, _LARGEST[name])
+        found = self.notes.number(params.get(name), first, _LARGEST[name])
         if found is None:
             self._assume(name, default)
             return default
@@ -201,7 +197,7 @@ class PartReader(ValueReader):
         group = self._group.groups.get(group_name)
         if group is None:
             return []
-        count = self.number(group.params.get("numOfSets"), 0, 1000)
+        count = self.notes.number(group.params.get("numOfSets"), 0, 1000)
         if count is None:
             self.notes.at(
                 group.element, "missing", "no usable numOfSets: the robot refuses such a file; no set is used"
@@ -217,11 +213,11 @@ class PartReader(ValueReader):
             if element is None:
                 self.notes.at(group.element, "missing", f"numOfSets is {count}, but there is no {prefix}{number}")
                 continue
-            row = self.numbers(element)
+            row = self.notes.numbers(element)
             if row is None:
                 continue
             if len(row) != width:
-                self.refuse(element, f"{len(row)} numbers, not {width} ({columns})")
+                self.notes.refuse(element, f"{len(row)} numbers, not {width} ({columns})")
             else:
                 sets.append((element, row))
         for name, element in group.params.items():
@@ -237,9 +233,11 @@ class PartReader(ValueReader):
             of_patch = self._boards_of(element, patch)
             boards = tuple(board for board in of_patch if first <= board <= last)
             if of_patch and not boards:
-                self.refuse(element, f"no board on its bus is {first} to {last}")
+                self.notes.refuse(element, f"no board on its bus is {first} to {last}")
             elif not 1 <= period_ms <= 255 or not 0 <= skin_type <= 15 or not 0 <= no_load <= 255:
-                self.refuse(element, f"period {period_ms}, skinType {skin_type} or noLoad {no_load} is impossible")
+                self.notes.refuse(
+                    element, f"period {period_ms}, skinType {skin_type} or noLoad {no_load} is impossible"
+                )
             elif boards:
                 self._part.board_sets.append(BoardSet(element, patch, boards, period_ms, skin_type, no_load))
 
@@ -250,11 +248,11 @@ class PartReader(ValueReader):
             patch = self._patch_of(element, patch)
             of_patch = self._boards_of(element, patch)
             if of_patch and board not in of_patch:
-                self.refuse(element, f"there is no board {board} on its bus")
+                self.notes.refuse(element, f"there is no board {board} on its bus")
             elif not 0 <= first <= last < TRIANGLES:
-                self.refuse(element, f"triangles {first} to {last}: the firmware ignores a range outside 0-15")
+                self.notes.refuse(element, f"triangles {first} to {last}: the firmware ignores a range outside 0-15")
             elif not 0 <= shift <= 255 or not 0 <= cdc_offset <= 0xFFFF:
-                self.refuse(element, f"shift {shift} or cdcOffset {cdc_offset:#x} is impossible")
+                self.notes.refuse(element, f"shift {shift} or cdcOffset {cdc_offset:#x} is impossible")
             elif of_patch:
                 if enabled not in (0, 1):
                     self.notes.at(element, "info", f"enabled = {enabled}: counts as 1, as on the robot")
@@ -275,7 +273,7 @@ class PartReader(ValueReader):
     def _boards_of(self, element: Element, patch: int) -> tuple[int, ...]:
         boards = self._part.boards
         if patch not in boards and boards:
-            self.refuse(element, f"there is no patch {patch}")
+            self.notes.refuse(element, f"there is no patch {patch}")
         return boards.get(patch, ())
 
     # The old set-up
@@ -285,7 +283,7 @@ class PartReader(ValueReader):
         self._part.old = {board: dict(OLD_DEFAULTS) for board in boards}
         for name, default in OLD_DEFAULTS.items():
             element = self._group.params.get(name)
-            row = self.numbers(element)
+            row = self.notes.numbers(element)
             if element is None or row is None:
                 continue
             if len(row) != len(boards):
@@ -295,7 +293,7 @@ class PartReader(ValueReader):
                 if 0 <= value <= 255:
                     self._part.old[board][name] = value
                 else:
-                    self.refuse(element, f"{value} is not a byte")
+                    self.notes.refuse(element, f"{value} is not a byte")
 
     # Other elements
 

@@ -276,13 +276,7 @@ _CHANNEL = 0xFF
 
 @dataclass(frozen=True)
 class PartPort:
-    """One port of a part.
-
-    Attributes:
-        name: of the body part, the end of the port's name.
-        options: of the driver ``yarp``.
-        groups: places of its sensors; their uid lack the bus.
-    """
+    """One port of a part, with options of the driver ``yarp``; the uids of its places lack the bus."""
 
     name: str
     options: YarpOptions

@@ -69,6 +69,8 @@ class Element:
 
 
 class Notes:
+    """Remarks, and values of elements: those that cannot be read are noted, and count as not given."""
+
     def __init__(self) -> None:
         self._notes: dict[Note, None] = {}
 
@@ -83,29 +85,6 @@ class Notes:
 
     def all(self) -> list[Note]:
         return list(self._notes)
-
-
-def words(text: str) -> list[str]:
-    """Return the words of a value, without quotes and brackets."""
-    return text.translate(str.maketrans('()"', "   ")).split()
-
-
-def number(text: str) -> int:
-    """Return a whole number as these files write it."""
-    if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
-        raise ValueError(f"{text[:20]!r} is not a whole number")
-    try:
-        value = int(text, 16) if text.lower().startswith("0x") else int(text, 10)
-    except ValueError:
-        raise ValueError(f"{text!r} is not a whole number") from None
-    return value
-
-
-class ValueReader:
-    """Read values of elements; note those that cannot be read, which count as not given."""
-
-    def __init__(self, notes: Notes) -> None:
-        self.notes = notes
 
     def numbers(self, element: Element | None) -> list[int] | None:
         """Return all words of an element as numbers; None if there is no element, or a word is not a number."""
@@ -144,11 +123,27 @@ class ValueReader:
             value, clear = False, found == ["false"]
         if not clear:
             text = f"{element.text!r} is neither true nor false; taken to be {str(value).lower()}, as on the robot"
-            self.notes.at(element, "odd", text)
+            self.at(element, "odd", text)
         return value
 
     def refuse(self, element: Element, why: str) -> None:
-        self.notes.at(element, "unknown", f"{why}; left out")
+        self.at(element, "unknown", f"{why}; left out")
+
+
+def words(text: str) -> list[str]:
+    """Return the words of a value, without quotes and brackets."""
+    return text.translate(str.maketrans('()"', "   ")).split()
+
+
+def number(text: str) -> int:
+    """Return a whole number as these files write it."""
+    if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
+        raise ValueError(f"{text[:20]!r} is not a whole number")
+    try:
+        value = int(text, 16) if text.lower().startswith("0x") else int(text, 10)
+    except ValueError:
+        raise ValueError(f"{text!r} is not a whole number") from None
+    return value
 
 
 def read_bytes(path: Path) -> bytes:

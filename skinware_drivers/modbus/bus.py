@@ -284,12 +284,7 @@ class ModbusBus(KernelBus):
         return 0
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send a message to a unit between two reads.
-
-        Args:
-            identifier: the unit.
-            payload: function and data of a read or write of registers.
-        """
+        """Send function and data of a read or write of registers to a unit (``identifier``) between two reads."""
         self.may_send_by(self._port)
         message = wire.Message(identifier, payload)
         if not 0 <= identifier <= 255 or not payload or not wire.reply_size(payload):

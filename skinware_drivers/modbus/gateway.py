@@ -38,12 +38,7 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
 
 
 class Retry:
-    """Space the attempts at something that fails again and again.
-
-    Attributes:
-        times: failures in a row.
-        until_ns: when the next attempt may be made.
-    """
+    """Space the attempts at something that fails again and again: none before ``until_ns``."""
 
     def __init__(self) -> None:
         self.times = 0
@@ -57,11 +52,7 @@ class Retry:
 
 
 class Guest(ABC):
-    """A program that asks.
-
-    Attributes:
-        waiting: its questions in the order in which it asked, each with the number that the program gave it.
-    """
+    """A program that asks; its questions wait in the order in which it asked, with the numbers that it gave them."""
 
     def __init__(self) -> None:
         self.waiting: deque[Message] = deque()
@@ -133,11 +124,7 @@ class Guests:
             self._refuse_first(guest)
 
     def answer(self, reply: bytes | None, time_ns: int) -> None:
-        """End the open question, if there is one.
-
-        Args:
-            reply: what the unit answered, which may be an exception; None: nothing.
-        """
+        """End the open question, if there is one, with a reply (or exception) of the unit, or None."""
         if self._open is None:
             return
         guest, question = self._open
@@ -173,8 +160,7 @@ class Guests:
 class _Program(Guest):
     """A program at a port: its own connection, or the serial port that it may open.
 
-    Attributes:
-        watched: the events for which the gateway waits at that port.
+    The gateway waits for the events ``watched`` at that port.
     """
 
     def __init__(self, port: Port, messages: wire.TcpMessages | wire.RtuMessages) -> None:

@@ -180,13 +180,9 @@ class Row(NamedTuple):
 
 
 class Area:
-    """Registers without a gap between them.
+    """Registers without a gap between them: their bytes as they came, and when.
 
-    Attributes:
-        where: unit, function, first address and count.
-        registers: (n, 2) uint8, as they came.
-        heard_ns: (n,) int64, when each came.
-        blocks: identifier, first register and declaration of each block in it.
+    ``blocks`` has the identifier, first register and declaration of each block in it.
     """
 
     def __init__(self, where: Registers) -> None:
@@ -221,13 +217,9 @@ class Image:
                     break
 
     def put(self, area: int, first: int, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
-        """Store registers that were read; return the frames that are whole now.
+        """Store registers of an area that were read; return the frames that are whole now.
 
-        Args:
-            first: their first register in it.
-            data: their bytes.
-            time_ns: when they came.
-            since_ns: registers that came before do not count.
+        Registers that came before ``since_ns`` do not count.
         """
         place = self.areas[area]
         end = first + len(data) // 2

@@ -65,12 +65,7 @@ _POINTS_OF_PRESSURE = (
 
 
 class _Edition(NamedTuple):
-    """The command registers of an edition: the first, and how many.
-
-    Attributes:
-        switches: switch its sensors on.
-        reset: set the sensors' channels up again; None: it has no such registers.
-    """
+    """The command registers of an edition: the first, and how many; None: it has no such registers."""
 
     switches: tuple[int, int]
     calibration: tuple[int, int]
@@ -86,12 +81,8 @@ _EDITIONS: dict[EditionName, _Edition] = {
 """In the order of their numbers in register 970, from 1 on."""
 
 
-class _Content(NamedTuple):
-    """Sensor types, modules, and the registers of each module."""
-
-    types: Sequence[SensorType]
-    modules: Sequence[Module]
-    registers: Sequence[Registers]
+_Content = tuple[Sequence[SensorType], Sequence[Module], Sequence[Registers]]
+"""Sensor types, modules, and the registers of each module."""
 
 
 def _touch(unit: int, with_status: bool) -> _Content:
@@ -106,7 +97,7 @@ def _touch(unit: int, with_status: bool) -> _Content:
         modules.append(Module([Sensor(PROXIMITY.name, finger)], 5 + finger, "1x1", f"{name} proximity"))
         place = 15 + 2 * finger
         registers.append(_of_touch(unit, 5 + finger, finger, place, ">u4", 1, _NO_PROXIMITY, with_status))
-    return _Content(types, modules, registers)
+    return types, modules, registers
 
 
 def _of_touch(
@@ -135,7 +126,7 @@ def _pressure(unit: int, kind: int) -> _Content:
     sums = taxels(len(parts), _SUM.name)
     modules.append(Module(sums, len(parts), "sums", "sums"))
     registers.append(Registers(6001, len(parts), unit, READ_INPUT, patch=0, module=len(parts)))
-    return _Content((point, _SUM), modules, registers)
+    return (point, _SUM), modules, registers
 
 
 def _force3d(unit: int) -> _Content:
@@ -148,7 +139,7 @@ def _force3d(unit: int) -> _Content:
         registers.append(_of_forces(unit, finger, 7200 + 100 * finger, 31))
     modules.append(Module(taxels(4, *(axis.name for axis in _SUMS)), 4, "sums", "sums"))
     registers.append(_of_forces(unit, 4, 7100, 4))
-    return _Content((*axes, *_SUMS), modules, registers)
+    return (*axes, *_SUMS), modules, registers
 
 
 def _of_forces(unit: int, module: int, address: int, points: int) -> Registers:
@@ -170,7 +161,7 @@ def _array_pressure(unit: int) -> _Content:
         modules.append(Module([Sensor(kind.name, finger) for kind in types], finger, "force", f"{name} tip"))
         values = [Values(2 * (80 + 5 * finger), ">u2", 5)]
         registers.append(Registers(8020, 105, unit, READ_INPUT, patch=0, module=finger, flags=[cold], values=values))
-    return _Content(types, modules, registers)
+    return types, modules, registers
 
 
 class Revo2Options(Options, frozen=True):
@@ -320,15 +311,16 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
 
     def _declare(self, said: _SaidEdition, side: _Side, *, with_status: bool) -> None:
         if said.edition == "touch":
-            what = _touch(self._unit, with_status)
+            content = _touch(self._unit, with_status)
         elif said.edition == "pressure":
-            what = _pressure(self._unit, said.kind)
+            content = _pressure(self._unit, said.kind)
         else:
-            what = (_force3d if said.edition == "force3d" else _array_pressure)(self._unit)
-        self.types: Sequence[SensorType] = what.types
-        self.registers: Sequence[Registers] = what.registers
-        self.patches: Sequence[Patch] = [Patch(f"{side} hand", what.modules)]
-        self.geometry: Geometry | None = _places(Hand(side), what.modules)
+            content = (_force3d if said.edition == "force3d" else _array_pressure)(self._unit)
+        types, modules, registers = content
+        self.types: Sequence[SensorType] = types
+        self.registers: Sequence[Registers] = registers
+        self.patches: Sequence[Patch] = [Patch(f"{side} hand", modules)]
+        self.geometry: Geometry | None = _places(Hand(side), modules)
 
 
 def _places(hand: Hand, modules: Sequence[Module]) -> Geometry:

@@ -154,7 +154,6 @@ class _Said(NamedTuple):
     """The form of the data, as the hand reports it.
 
     Attributes:
-        name: of its mapping.
         function: that reads its data.
         has_sums: it sends sums of zones, not single taxels.
         counts: taxels or zones of each pad.

@@ -48,12 +48,9 @@ _MBAP = struct.Struct(">HHHB")
 
 
 class Message(NamedTuple):
-    """A message to or from a unit.
+    """A message to or from a unit: the function and the bytes after it.
 
-    Attributes:
-        unit: address of the device, 0 to 255.
-        data: the function and the bytes after it.
-        number: of its transaction; 0 on a serial line, which has none.
+    The number is that of its transaction; a serial line has none.
     """
 
     unit: int

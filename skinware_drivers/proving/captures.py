@@ -24,14 +24,14 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
-from skinware.recording import Recording, WireTrack
+from skinware.recording import Recording
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus
 from skinware_drivers.proving.updates import Collected, Comparison, Decoding, compare, load
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, package_on
-from skinware_drivers.virtual.recorded import medium_of, replayed_bus, wire_of
+from skinware_drivers.virtual.recorded import Wire, medium_of, replayed_bus, wire_of
 
 _NAME = "captured"
 _SLOTS = 64
@@ -134,14 +134,14 @@ def _driver_type(recording: Recording, about: Mapping[str, Any]) -> str:
     return str(about["driver_type"])
 
 
-def _wires(recording: Recording) -> Sequence[WireTrack]:
+def _wires(recording: Recording) -> Sequence[Wire]:
     if len({wire.driver for wire in recording.wires}) > 1:
         names = ", ".join(sorted({wire.driver for wire in recording.wires}))
         raise ConfigurationError(f"{recording.path}: wires of several drivers ({names}); a capture has one driver")
     return recording.wires or [wire_of(recording)]  # raises an error that names the reason
 
 
-def _began_ns(recording: Recording, wires: Sequence[WireTrack]) -> int:
+def _began_ns(recording: Recording, wires: Sequence[Wire]) -> int:
     first = next((item for wire in wires for item in wire.items()), None)
     return 0 if first is None else first.time_ns - (first.epoch_ns - recording.start_ns)
 
@@ -156,7 +156,7 @@ class _ReplayedWire:
     def __init__(
         self,
         recording: Recording,
-        wire: WireTrack,
+        wire: Wire,
         driver: type[AnyAdapter],
         options: Mapping[str, Any],
         listens: bool,

@@ -132,7 +132,11 @@ def _of_module(old: ModuleUpdates, new: ModuleUpdates) -> tuple[int, Difference 
     common = min(len(old), len(new))
     if not _differ(old.values[-common:], new.values[-common:]).any():
         return common, None
-    nearest, is_paired = _partners(old.time_ns, new.time_ns)
+    # the decoded update nearest to each recorded one, if the two are nearest to each other
+    nearest, back = _nearest(old.time_ns, new.time_ns), _nearest(new.time_ns, old.time_ns)
+    apart_ns = np.abs(new.time_ns[nearest] - old.time_ns)
+    usual_ns = float(np.median(np.diff(old.time_ns))) if len(old) > 1 else np.inf
+    is_paired = (back[nearest] == np.arange(len(old))) & (apart_ns < usual_ns / 2)
     rows = np.flatnonzero(is_paired)
     if not len(rows):
         return 0, _without_partner(old, 0, is_then=True)
@@ -155,14 +159,6 @@ def _differ(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> Flags:
     """Return which values differ; NaN is equal to NaN."""
     found: Flags = (one != other) & ~((one != one) & (other != other))
     return found
-
-
-def _partners(old_ns: Times, new_ns: Times) -> tuple[Times, Flags]:
-    """Return (k,) the decoded update nearest to each recorded one, and whether the two are nearest to each other."""
-    nearest, back = _nearest(old_ns, new_ns), _nearest(new_ns, old_ns)
-    apart_ns = np.abs(new_ns[nearest] - old_ns)
-    usual_ns = float(np.median(np.diff(old_ns))) if len(old_ns) > 1 else np.inf
-    return nearest, (back[nearest] == np.arange(len(old_ns))) & (apart_ns < usual_ns / 2)
 
 
 def _nearest(of_ns: Times, in_ns: Times) -> Times:

@@ -148,7 +148,8 @@ class PathHooks:
                 return 0
             self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
             try:
-                self._words.must_leave |= leaves
+                if leaves:
+                    self._words.must_leave = True
                 return hook(*arguments) or 0
             except BaseException as error:  # noqa: BLE001
                 self.error = error

@@ -56,7 +56,6 @@ class Xor(Checksum):
     init: int = 0
 
     def of(self, data: bytes) -> int:
-        """Return the checksum of data."""
         value = self.init
         for byte in data:
             value ^= byte
@@ -78,7 +77,6 @@ class Sum(Checksum):
     negative: bool = False
 
     def of(self, data: bytes) -> int:
-        """Return the checksum of data."""
         value = self.init + sum(data)
         return (-value if self.negative else value) & ((1 << self.width) - 1)
 
@@ -112,7 +110,6 @@ class Crc(Checksum):
             raise ConfigurationError(f"a CRC of {self.width} bits: 8 to 32 can be had")
 
     def of(self, data: bytes) -> int:
-        """Return the checksum of data."""
         if self.native is not None:
             return self.native(data)
         state, table = self.first_state, self.table

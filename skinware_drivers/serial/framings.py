@@ -127,7 +127,6 @@ class Recurring(Framing):
         return _RecurringFramer(self)
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Return a frame as it is sent."""
         check_body(identifier - self.identifier, payload, None, self.minimum_body, self.maximum_body)
         return self.marker + payload
 

@@ -54,14 +54,9 @@ def find_port(channel: str, options: SerialOptions) -> str:
             wanted.append(port)
     if len(wanted) == 1:
         return str(wanted[0].device)
-    what = " and ".join(
-        text
-        for text, given in (
-            (f"serial number {options.serial_number}", options.serial_number),
-            (f"VID:PID {options.vid_pid}", options.vid_pid),
-        )
-        if given
-    )
+    given = [f"serial number {options.serial_number}"] if options.serial_number else []
+    given += [f"VID:PID {options.vid_pid}"] if options.vid_pid else []
+    what = " and ".join(given)
     if wanted:
         numbers = ", ".join(f"{port.device} (serial_number={port.serial_number})" for port in wanted)
         raise BusNotAvailable(f"{len(wanted)} serial ports have {what}: {numbers}; say which")

@@ -48,13 +48,8 @@ class BadDescription(BusError):
 class Greeting:
     """The answer to a greeting, and the announcement after a reset.
 
-    Attributes:
-        major, minor: version of the protocol that it speaks.
-        reset: reason of its last reset, in words.
-        streaming: it was started.
-        uptime_s: since that reset, s.
-        crc: of its description.
-        n_items: number of items of its description.
+    It has the version of the protocol, the reason of the last reset in words and the time since then, whether the patch
+    was started, and the checksum and number of items of its description.
     """
 
     major: int
@@ -80,14 +75,7 @@ class Greeting:
 
 @dataclass(frozen=True)
 class Report:
-    """The counters of a patch.
-
-    Attributes:
-        uptime_s: since its last reset, s.
-        sent: data messages sent since then.
-        dropped: data messages that its line had no room for.
-        bad_requests: damaged frames that it received.
-    """
+    """The counters of a patch since its last reset: data messages sent and dropped, and damaged frames received."""
 
     uptime_s: float
     sent: int
@@ -102,12 +90,7 @@ class Report:
 
 @dataclass(frozen=True)
 class ModuleKind:
-    """A kind of module.
-
-    Attributes:
-        dtype: of its values as they are sent, a numpy dtype.
-        taxels: sensor type of each value of each taxel, by name; None: the value has no meaning.
-    """
+    """A kind of module; ``taxels`` has the sensor type of each value of each taxel, None for one without meaning."""
 
     name: str
     dtype: str
@@ -120,12 +103,7 @@ class ModuleKind:
 
 @dataclass(frozen=True)
 class Description:
-    """The description of a patch.
-
-    Attributes:
-        period_us: of a cycle, unless another is set; with the shortest and the longest possible.
-        modules: kind of each module.
-    """
+    """The description of a patch: the period of a cycle unless another is set, and the kind of each module."""
 
     product: str
     serial_number: str

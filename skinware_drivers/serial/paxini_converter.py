@@ -103,8 +103,6 @@ class ConverterBoard:
         sensors: ids of the sensors that must answer; none: all that answer.
         points: taxels of each; 0: by their part codes.
         is_away: returns whether the line is closed.
-        period_s: time between two questions to the same sensor.
-        report: called with the notices of patches.
     """
 
     framing = Packet(

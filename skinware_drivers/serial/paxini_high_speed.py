@@ -102,13 +102,7 @@ UNKNOWN_SLOTS: Framing = framing_of(())
 
 
 class HighSpeedBoard:
-    """One board: a patch with a module for each connected slot.
-
-    Args:
-        hand: with its modules.
-        use: called with a framing for the line; bytes that are no whole frame yet are dropped.
-        report: called with the notices of patches.
-    """
+    """One board: a patch with a module for each connected slot; ``use`` sets the framing of the line."""
 
     layout: Layout  # once it was described
     geometry: Geometry | None = None

@@ -80,12 +80,7 @@ def model_of(points: int) -> str:
 
 
 def module(number: int, points: int, *, key: int = 0, name: str = "") -> Module:
-    """Return a module with its taxels, each of three axes, and its resultant.
-
-    Args:
-        number: of the module on its bus; the uids of its taxels are ``number << 16`` and the next ones.
-        key: number by which frames name it.
-    """
+    """Return a module with its taxels, each of three axes, and its resultant; uids begin with ``number << 16``."""
     first_uid = number << _UID_OF_MODULE
     of_taxels = taxels(points, *(t.name for t in _TAXEL_TYPES), first_uid=first_uid)
     resultant = taxels(1, *(t.name for t in _RESULTANT_TYPES), first_uid=first_uid)
@@ -95,10 +90,7 @@ def module(number: int, points: int, *, key: int = 0, name: str = "") -> Module:
 def values(points: int, taxels_at: int, resultant_at: int, step: int) -> list[Values]:
     """Return the places of a module's values in a payload.
 
-    Args:
-        taxels_at: first byte of the taxels.
-        resultant_at: first byte of the resultant.
-        step: bytes from one axis of the resultant to the next; the first of them counts.
+    The axes of the resultant are ``step`` bytes apart, of which the first counts.
     """
     n = TAXEL * points
     found = [
@@ -113,12 +105,7 @@ def values(points: int, taxels_at: int, resultant_at: int, step: int) -> list[Va
 
 @dataclass(frozen=True)
 class Slot:
-    """A place of a high-speed board at which a module is connected.
-
-    Attributes:
-        number: of the slot: 0 to 19 on fingers, 20 to 27 on the palm.
-        points: taxels of the module in the board's frames.
-    """
+    """A place of a high-speed board with a module of so many taxels: 0 to 19 on fingers, 20 to 27 on the palm."""
 
     number: int
     points: int

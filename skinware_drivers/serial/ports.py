@@ -52,11 +52,9 @@ class Port(ABC):
 
 
 class DescriptorPort(Port):
-    """A tty or a socket.
+    """A tty or a socket, whose descriptor an object of pyserial's owns.
 
-    Args:
-        serial: pyserial's object, which owns the descriptor.
-        hang_up: False: DTR and RTS keep their levels when it is closed.
+    Without ``hang_up``, DTR and RTS keep their levels when it is closed.
     """
 
     def __init__(self, name: str, serial: Any, *, hang_up: bool = True) -> None:
@@ -210,11 +208,7 @@ class ThreadedPort(Port):
 
 
 class PtyPort(Port):
-    """The device's end of a pseudo terminal, which programs open as a serial port.
-
-    Args:
-        link: a symbolic link to the port; replaced if it is one.
-    """
+    """The device's end of a pseudo terminal, which programs open as a serial port, also by a symbolic ``link``."""
 
     def __init__(self, link: str = "") -> None:
         self._link = link

@@ -30,12 +30,7 @@ def weiss_packet(most_payload: int, **more: Any) -> Packet:
 
 
 class WeissAdapter(SerialAdapter[OptionsT]):
-    """One device, which reports its cells; :meth:`describe` keeps the report in ``_cells``.
-
-    Attributes:
-        answers: its answers; their status is u16 LE.
-        timeout_s, tries: time to wait for an answer, and number of questions.
-    """
+    """One device, which reports its cells; :meth:`describe` keeps the report in ``_cells``."""
 
     packet: ClassVar[Packet]
     answers: ClassVar[Answers]

@@ -1,6 +1,6 @@
 """Read topics of a DDS domain as a bus, each sample as the bytes that came (CDR): without ROS, and without publishing.
 
-A sample becomes a record of a stream: ``DD 5A``, length of the record u32, number of the topic u8, 0; the source's time
+A sample becomes a record of a stream: ``DD 5A``, length of the record u32, number of the topic u16; the source's time
 in 10 us u32; the sample with its encapsulation; CRC-32 of everything before it. All numbers are little-endian.
 :func:`samples` is the framing of such streams, which captures keep.
 """
@@ -8,6 +8,7 @@ in 10 us u32; the sample with its encapsulation; CRC-32 of everything before it.
 from __future__ import annotations
 
 import logging
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,8 +39,11 @@ if TYPE_CHECKING:
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 ENCAPSULATION = 4
+LONGEST = 1 << 20
+"""Bytes of the longest sample that is read."""
 _SYNC = b"\xdd\x5a"
-_HEAD = struct.Struct("<2sIBBI")
+_HEAD = struct.Struct("<2sIHI")
+_ROS_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 _STAMP_NS = 10_000
 SOURCE_TIME = DeviceTime(0, "<u4", _STAMP_NS / 1e9)
 """The time at which the publisher wrote a sample, in the body of its record."""
@@ -51,10 +55,12 @@ class DdsTopic:
 
     Attributes:
         name: in DDS, which ROS 2 begins with ``rt/``.
-        type_name: as in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``.
+        type_name: as in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``;
+            or with one slash, for types that are not of ROS.
         texts: definitions as in ``.msg`` files, by type without ``msg``. Publishers whose type is another are not read;
-            a topic can be declared once for each edition of its type.
-        number: identifier of its samples, 0 to 255.
+            a topic can be declared once for each edition of its type, and for each of several types: those are asked
+            for once one of them is published.
+        number: identifier of its samples, 0 to 65535.
     """
 
     name: str
@@ -65,8 +71,8 @@ class DdsTopic:
     @property
     def dds_type(self) -> str:
         """The name of its type in DDS."""
-        package, kind, plain = self.type_name.split("/")
-        return f"{package}::{kind}::dds_::{plain}_"
+        *package, plain = self.type_name.split("/")
+        return f"{'::'.join(package)}::dds_::{plain}_" if len(package) > 1 else f"{package[0]}::{plain}"
 
 
 @dataclass(frozen=True)
@@ -84,6 +90,13 @@ class HeardTopic:
     publishers: int
     drivers: tuple[str, ...] = ()
 
+    @property
+    def ros_type(self) -> str:
+        """Its type as a :class:`DdsTopic` names it; empty if it is no type of a message."""
+        if match := _ROS_TYPE.fullmatch(self.type_name):
+            return f"{match[1]}/msg/{match[2]}"
+        return self.type_name.replace("::", "/") if re.fullmatch(r"\w+::\w+", self.type_name) else ""
+
 
 def samples(longest: int) -> Packet:
     """Return the framing of records.
@@ -96,14 +109,14 @@ def samples(longest: int) -> Packet:
         length=Length(Field(2, 4), more=0),
         maximum=_HEAD.size + longest + CRC32.size,
         checksum=CRC32,
-        identifier=Field(6),
+        identifier=Field(6, 2),
         header=_HEAD.size - SOURCE_TIME.end,
     )
 
 
 def record(number: int, source_ns: int, sample: bytes) -> bytes:
     """Return the record of a sample that was written at a time, ns of any clock."""
-    head = _HEAD.pack(_SYNC, _HEAD.size + len(sample) + CRC32.size, number, 0, source_ns // _STAMP_NS & 0xFFFF_FFFF)
+    head = _HEAD.pack(_SYNC, _HEAD.size + len(sample) + CRC32.size, number, source_ns // _STAMP_NS & 0xFFFF_FFFF)
     return head + sample + CRC32.to_bytes(head + sample)
 
 
@@ -133,7 +146,25 @@ def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any
     return DdsDeviceBus(channel, options, **more)
 
 
-class DdsBus(ServerBus):
+class TopicBus(ServerBus):
+    """A bus of topics.
+
+    Attributes:
+        topics: to read; :class:`DdsAdapter` sets them.
+    """
+
+    topics: Sequence[DdsTopic] = ()
+
+    def heard(self) -> list[HeardTopic]:
+        """Return the topics that are published there, as far as that is known."""
+        raise NotImplementedError
+
+    def read_only(self, topic: DdsTopic) -> None:
+        """Read another topic in place of all others, from now on."""
+        raise NotImplementedError
+
+
+class DdsBus(TopicBus):
     """Topics of a domain. Its name is ``dds://DOMAIN?key=value``, with the number of the domain.
 
     It joins the domain as one participant, which publishes no topic, and never asks a publisher to send more.
@@ -144,9 +175,6 @@ class DdsBus(ServerBus):
     Raises:
         ConfigurationError: no such domain, an option is unknown or has a bad value, or the package cyclonedds is
             missing.
-
-    Attributes:
-        topics: to read; :class:`DdsAdapter` sets them.
     """
 
     options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
@@ -156,7 +184,6 @@ class DdsBus(ServerBus):
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self.topics: Sequence[DdsTopic] = ()
         self.domain: int = parse_domain(channel)
         _need_package(self.name)
         self._joined: DdsPort | None = None
@@ -169,6 +196,14 @@ class DdsBus(ServerBus):
         """Report publishers that cannot be read; that none sends is no reason to join the domain again."""
         SerialBus.check(self)
         self._report()
+
+    def heard(self) -> list[HeardTopic]:
+        return [] if self._joined is None else self._joined.heard()
+
+    def read_only(self, topic: DdsTopic) -> None:
+        self.topics = [topic]
+        if self._joined is not None:
+            self._joined.change(self.topics)
 
     def _open_port(self) -> Port:
         from skinware_drivers.streams.dds_ends import DdsPort
@@ -209,9 +244,11 @@ class DdsAdapter(SerialAdapter[OptionsT]):
 
     Attributes:
         topics: that it reads, with numbers by which its layout knows them.
+        reads_any_name: it reads topics of these types under any name.
     """
 
     topics: Sequence[DdsTopic] = ()
+    reads_any_name: ClassVar[bool] = False
 
     def fit(self, bus: Bus) -> None:
         """Give the bus framing and topics.
@@ -220,5 +257,5 @@ class DdsAdapter(SerialAdapter[OptionsT]):
             ConfigurationError: it is another kind of bus.
         """
         super().fit(bus)
-        if isinstance(bus, DdsBus):
+        if isinstance(bus, TopicBus):
             bus.topics = self.topics

@@ -11,7 +11,8 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +31,16 @@ from skinware.ros2.cyclone import join, reason, struct_type, write_bytes
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.streams.dds import SOURCE_TIME, DdsOptions, DdsTopic, HeardTopic, parse_domain, record, samples
+from skinware_drivers.streams.dds import (
+    LONGEST,
+    SOURCE_TIME,
+    DdsOptions,
+    DdsTopic,
+    HeardTopic,
+    parse_domain,
+    record,
+    samples,
+)
 
 _AT_ONCE = 16
 """Samples of a topic in one read."""
@@ -39,8 +49,9 @@ _SILENT_NS = 2 * NS_PER_S
 _UNREAD_NS = 5 * NS_PER_S
 """Time after which a publisher that no reader has matched is reported."""
 _NEW = SampleState.NotRead | ViewState.Any | InstanceState.Any
-_LONGEST_WRITTEN = 1 << 16
 _MOST_LISTED = 4096
+_ALL_BITS = (1 << 64) - 1
+"""Handles of matched publishers have a sign, those of samples have none."""
 
 News = tuple[int, str]
 """Level of logging, and text."""
@@ -83,20 +94,39 @@ class DdsPort(Port):
     longest_wait = 0
 
     def __init__(self, name: str, domain: int, options: DdsOptions, topics: Sequence[DdsTopic]) -> None:
-        self._name, self._topics = name, topics
+        self._name, self._topics, self._options = name, topics, options
+        self._heard: dict[int, tuple[str, str]] = {}
         self._sources: dict[str, _HeardPublisher] = {}
         self._publishers: dict[int, _Publisher] = {}
         self._news: list[News] = []
         self._refused = self._rejected = self._rejected_before = 0
         self._domain, self._participant = _joined(name, domain, options)
-        qos = _qos(options, Policy.History.KeepAll, Policy.ResourceLimits(options.depth, 1, options.depth))
+        self._readers: dict[int, DataReader] = {}
         with _as_bus_error(name):
-            self._readers = [DataReader(self._participant, _topic(self._participant, topic), qos) for topic in topics]
             self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-            self._waiting = _WaitingThread(self._participant, [*self._readers, self._publications])
+            self._waiting = _WaitingThread(self._participant, self._publications)
+        self.change(topics)
 
     def fileno(self) -> int:
         return self._waiting.event
+
+    def change(self, topics: Sequence[DdsTopic]) -> None:
+        """Read these topics alone; those that may have several types once one of these is published.
+
+        Raises:
+            BusNotAvailable: one cannot be read.
+        """
+        self._topics = topics
+        with _as_bus_error(self._name):
+            for number in tuple(self._readers):
+                self._waiting.forget(self._readers.pop(number))
+            for number, topic in enumerate(topics):
+                if len(set(self._types_of(topic.name))) == 1 or (topic.name, topic.dds_type) in self._heard.values():
+                    self._subscribe(number)
+
+    def heard(self) -> list[HeardTopic]:
+        """Return the topics that are published."""
+        return _counted(self._heard.values())
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
         """Return records of samples that have come, at most a few of each topic.
@@ -108,8 +138,9 @@ class DdsPort(Port):
         time_ns = now_ns()
         with _as_bus_error(self._name):
             self._look(time_ns)
-            records = [one for number in range(len(self._readers)) for one in self._take(number, time_ns)]
-            self._rejected = sum(reader.get_sample_rejected_status().total_count for reader in self._readers)
+            records = [one for number in tuple(self._readers) for one in self._take(number, time_ns)]
+            readers = self._readers.values()
+            self._rejected = sum(reader.get_sample_rejected_status().total_count for reader in readers)
         self._waiting.go_on.set()
         return b"".join(records)
 
@@ -137,7 +168,8 @@ class DdsPort(Port):
                 continue
             one.is_judged = True
             with _as_bus_error(self._name):
-                matched = {each for reader in self._readers for each in reader.get_matched_publications()}
+                readers = self._readers.values()
+                matched = {each & _ALL_BITS for reader in readers for each in reader.get_matched_publications()}
             if publisher not in matched and one.type_name in self._types_of(one.topic):
                 self._tell(
                     f"a publisher of {one.topic} cannot be read: its type {one.type_name} has another structure, or it"
@@ -158,9 +190,13 @@ class DdsPort(Port):
         for one in self._publications.take(_AT_ONCE):
             publisher = one.sample_info.instance_handle
             if one.sample_info.valid_data and one.sample_info.instance_state == InstanceState.Alive:
+                if len(self._heard) < _MOST_LISTED:
+                    self._heard[publisher] = one.topic_name, one.type_name
                 if publisher not in self._publishers and self._types_of(one.topic_name):
                     self._welcome(publisher, _Publisher(one.topic_name, one.type_name, time_ns))
-            elif (gone := self._publishers.pop(publisher, None)) is not None:
+                continue
+            self._heard.pop(publisher, None)
+            if (gone := self._publishers.pop(publisher, None)) is not None:
                 self._tell(f"a publisher of {gone.topic} is gone")
                 source = self._sources.get(gone.topic)
                 if source is not None and source.publisher == publisher:
@@ -171,21 +207,38 @@ class DdsPort(Port):
             return
         self._publishers[publisher] = one
         types = self._types_of(one.topic)
+        for number, topic in enumerate(self._topics):
+            if (topic.name, topic.dds_type) == (one.topic, one.type_name) and number not in self._readers:
+                self._subscribe(number)
         if one.type_name not in types:
+            known = types[0] if len(set(types)) == 1 else f"one of {len(types)} that are known"
             self._tell(
-                f"a publisher of {one.topic} cannot be read: its type is {one.type_name}, not {types[0]}",
+                f"a publisher of {one.topic} cannot be read: its type is {one.type_name}, not {known}",
                 logging.WARNING,
             )
             return
         self._tell(f"a publisher of {one.topic} is there")
-        others = sum(1 for each in self._publishers.values() if (each.topic, each.type_name) == (one.topic, types[0]))
+        others = sum(
+            1 for each in self._publishers.values() if (each.topic, each.type_name) == (one.topic, one.type_name)
+        )
         if others > 1:
             self._tell(f"{one.topic} has {others} publishers: only the first is read", logging.WARNING)
+
+    def _subscribe(self, number: int) -> None:
+        depth = self._options.depth
+        qos = _qos(self._options, Policy.History.KeepAll, Policy.ResourceLimits(depth, 1, depth))
+        reader = DataReader(self._participant, _topic(self._participant, self._topics[number]), qos)
+        self._readers[number] = reader
+        self._waiting.watch(reader)
 
     def _take(self, number: int, time_ns: int) -> Iterator[bytes]:
         topic = self._topics[number]
         for sample in self._readers[number].take(_AT_ONCE):
-            if isinstance(sample, _Bytes) and self._is_heard(topic.name, number, sample.sample_info, time_ns):
+            if not isinstance(sample, _Bytes):
+                continue
+            if len(sample) > LONGEST:
+                self._refused += 1
+            elif self._is_heard(topic.name, number, sample.sample_info, time_ns):
                 yield record(topic.number, sample.sample_info.source_timestamp, sample)
 
     def _is_heard(self, name: str, reader: int, info: Any, time_ns: int) -> bool:
@@ -207,15 +260,23 @@ class DdsPort(Port):
 class _WaitingThread:
     """A thread that makes ``event`` readable when there is something to read, until ``go_on`` is set."""
 
-    def __init__(self, participant: DomainParticipant, readers: Sequence[Any]) -> None:
+    def __init__(self, participant: DomainParticipant, reader: Any) -> None:
         self.event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
-        self._conditions = [ReadCondition(reader, _NEW) for reader in readers]
-        for condition in (*self._conditions, self._woken):
-            self._waitset.attach(condition)
+        self._conditions: dict[Any, ReadCondition] = {}
+        self._waitset.attach(self._woken)
+        self.watch(reader)
         self.go_on, self._is_over = threading.Event(), False
         self._thread = threading.Thread(target=self._run, name="skinware dds", daemon=True)
         self._thread.start()
+
+    def watch(self, reader: Any) -> None:
+        """Wake up for what this reader has, too."""
+        self._conditions[reader] = condition = ReadCondition(reader, _NEW)
+        self._waitset.attach(condition)
+
+    def forget(self, reader: Any) -> None:
+        self._waitset.detach(self._conditions.pop(reader))
 
     def calm_down(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -228,7 +289,7 @@ class _WaitingThread:
         self._woken.set(True)
         self.go_on.set()
         self._thread.join()
-        for condition in (*self._conditions, self._woken):
+        for condition in (*self._conditions.values(), self._woken):
             self._waitset.detach(condition)
         self._conditions.clear()
         os.close(self.event)
@@ -271,13 +332,10 @@ class _PublishingPort(Port):
     def __init__(self, name: str, domain: int, options: DdsOptions, topics: Sequence[DdsTopic]) -> None:
         self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)  # never readable: nothing is heard
         self._domain, self._participant = _joined(name, domain, options)
-        qos = _qos(options, Policy.History.KeepLast(options.depth))
-        self._framer = samples(_LONGEST_WRITTEN).framer()
-        with _as_bus_error(name):
-            self._writers = {
-                topic.number: DataWriter(self._participant, _topic(self._participant, topic), qos)
-                for topic in reversed(topics)
-            }
+        self._name, self._qos = name, _qos(options, Policy.History.KeepLast(options.depth))
+        self._framer = samples(LONGEST).framer()
+        self._topics = {topic.number: topic for topic in reversed(topics)}
+        self._writers: dict[int, DataWriter] = {}
 
     def fileno(self) -> int:
         return self._event
@@ -288,11 +346,18 @@ class _PublishingPort(Port):
     def write(self, data: bytes) -> int:
         """Publish the whole records; what is no sample of its topic is not published."""
         for frame in self._framer.feed(data):
-            writer = self._writers.get(frame.identifier)
-            if writer is not None and write_bytes is not None:
+            topic = self._topics.get(frame.identifier)
+            if topic is not None and write_bytes is not None:
+                writer = self._writers.get(topic.number) or self._publish(topic)
                 sample = frame.body[SOURCE_TIME.end :]
                 write_bytes(writer._ref, sample + bytes(-len(sample) % 4))  # noqa: SLF001, for writing bytes
         return len(data)
+
+    def _publish(self, topic: DdsTopic) -> DataWriter:
+        with _as_bus_error(self._name):
+            writer = DataWriter(self._participant, _topic(self._participant, topic), self._qos)
+        self._writers[topic.number] = writer
+        return writer
 
     def close(self) -> None:
         if self._event >= 0:
@@ -312,15 +377,21 @@ def heard_topics(channel: str, options: dict[str, str], duration_s: float) -> li
     """
     name = f"bus dds://{channel}"
     domain, participant = _joined(name, parse_domain(channel), options_from_strings(DdsOptions, options))
-    counts: dict[tuple[str, str], int] = {}
     with _as_bus_error(name):
         publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
         time.sleep(duration_s)
-        for one in publications.read(_MOST_LISTED):
-            if one.sample_info.valid_data and one.sample_info.instance_state == InstanceState.Alive:
-                counts[one.topic_name, one.type_name] = counts.get((one.topic_name, one.type_name), 0) + 1
+        found = _counted(
+            (one.topic_name, one.type_name)
+            for one in publications.read(_MOST_LISTED)
+            if one.sample_info.valid_data and one.sample_info.instance_state == InstanceState.Alive
+        )
     del publications, participant, domain
-    return [HeardTopic(topic, kind, count) for (topic, kind), count in sorted(counts.items())]
+    return found
+
+
+def _counted(published: Iterable[tuple[str, str]]) -> list[HeardTopic]:
+    """Return topics and types of publishers, each once with the number of its publishers."""
+    return [HeardTopic(topic, kind, count) for (topic, kind), count in sorted(Counter(published).items())]
 
 
 @contextlib.contextmanager

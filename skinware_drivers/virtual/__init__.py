@@ -2,7 +2,7 @@
 
 from skinware_drivers.adapter import VirtualAdapter
 from skinware_drivers.virtual.device import Device, EmulatorOptions
-from skinware_drivers.virtual.emulator import CanFrame, Emulator, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Emulator, Places, on_a_grid
 from skinware_drivers.virtual.serial_device import ModbusEmulator, SerialEmulator, SerialEmulatorOptions, cut_packets
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "Emulator",
     "EmulatorOptions",
     "ModbusEmulator",
+    "Places",
     "SerialEmulator",
     "SerialEmulatorOptions",
     "VirtualAdapter",

@@ -129,7 +129,15 @@ class VirtualCanBus(Bus):
             raise BusNotAvailable(f"{self.name} is not open")
         now_ns = self._clock()
         if len(self._pending) < batch.free:
-            self._fetch(now_ns)
+            if self._due_ns is not None and self._due_ns < now_ns - _LONGEST_BACKLOG_NS:
+                self.counters.dropped += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+            for frame in self.hardware.emit(now_ns):
+                if len(frame.payload) <= self.payload_size:
+                    self._pending.append(frame)
+                else:
+                    self.counters.refused += 1
+                    self.samples.note(Unused.REFUSED, frame.identifier, frame.payload)
+                    self.tap.keep_frame(*frame)
         if self._wire is not None:
             self.wire_bits = self._wire.bits
         frames, self._pending = self._pending[: batch.free], self._pending[batch.free :]
@@ -182,18 +190,6 @@ class VirtualCanBus(Bus):
         self._present = True
 
     # Within
-
-    def _fetch(self, now_ns: int) -> None:
-        if self._due_ns is not None and self._due_ns < now_ns - _LONGEST_BACKLOG_NS:
-            self.counters.dropped += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
-        frames = self.hardware.emit(now_ns)
-        fitting = [frame for frame in frames if len(frame.payload) <= self.payload_size]
-        for frame in frames:
-            if len(frame.payload) > self.payload_size:
-                self.counters.refused += 1
-                self.samples.note(Unused.REFUSED, frame.identifier, frame.payload)
-                self.tap.keep_frame(*frame)
-        self._pending += fitting
 
     def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:
         """Write all frames as rows of :func:`skinware_drivers.bus.wire_dtype` at once."""

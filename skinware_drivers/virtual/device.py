@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from collections import deque
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
 
 from skinware_drivers.options import Options
-from skinware_drivers.virtual.wire import Transmitter
+from skinware_drivers.virtual.wire import Transmission
 
 Probability = Annotated[float, Meta(ge=0, le=1)]
 Seconds = Annotated[float, Meta(ge=0)]
@@ -55,41 +56,12 @@ class EmulatorOptions(Options, frozen=True, forbid_unknown_fields=True, kw_only=
     boot_s: Annotated[Seconds, Meta(description="seconds for which a restarted device ignores commands")] = 0.5
 
 
-class Actor(Protocol):
-    """Something on the wire that does things by itself."""
-
-    def next_event_ns(self) -> int | None:
-        """Return the time at which ``run`` has something to do."""
-
-    def run(self, now_ns: int) -> None:
-        """Do what is due: queue frames on the wire."""
-
-    def skip_to(self, now_ns: int) -> int:
-        """Leave out what is due before ``now_ns``; return how many frames that would have been."""
-
-
-class Scheduled(NamedTuple):
-    time_ns: int
-    action: Callable[[int], object]
-
-
-class TimerOwner(Protocol):
-    """The emulator of a device, as its timers call it."""
-
-    @property
-    def options(self) -> EmulatorOptions: ...
-
-    def on_timer(self, device: Device, name: str, time_ns: int) -> None: ...
-
-    def skipped(self, device: Device, name: str, times: int) -> int: ...
-
-
 class Device:
     """One emulated device.
 
     Attributes:
         number: its name in the emulator's options.
-        stage: the emulator.
+        queue: frames that wait for the wire.
         memory: settings by commands; gone after a restart.
         cycle: bursts sent since the first power-up; the number of the next one.
         alive: it has power.
@@ -99,17 +71,16 @@ class Device:
         random: source of the faults of its frames.
     """
 
-    def __init__(self, number: int, stage: TimerOwner, transmitter: Transmitter, now_ns: int) -> None:
+    def __init__(self, number: int, queue: deque[Transmission], now_ns: int, seed: int) -> None:
         self.number = number
-        self.stage = stage
-        self.transmitter = transmitter
+        self.queue = queue
         self.memory: dict[str, Any] = {}
         self.cycle: int = 0
         self.alive = True
         self.ready_ns = now_ns
         self.streams_from_ns: int | None = None
         self.sampled_ns = now_ns
-        self.random = np.random.default_rng([stage.options.seed, number, 1])
+        self.random = np.random.default_rng([seed, number, 1])
         self._timers: dict[str, tuple[int, int]] = {}  # name -> next, period
 
     def every(self, name: str, period_ns: int, first_ns: int) -> None:
@@ -131,21 +102,19 @@ class Device:
         self.streams_from_ns = None
 
     def next_event_ns(self) -> int | None:
-        """Return the time at which ``run`` has something to do."""
+        """Return the time at which a timer is due."""
         return min((next_ns for next_ns, _ in self._timers.values()), default=None)
 
-    def run(self, now_ns: int) -> None:
-        """Do what is due."""
+    def due(self, now_ns: int) -> Iterator[tuple[str, int]]:
+        """Yield name and time of each timer that is due; it then runs on."""
         for name, (next_ns, period_ns) in list(self._timers.items()):
             if next_ns <= now_ns and name in self._timers:
                 self._timers[name] = next_ns + period_ns, period_ns
-                self.stage.on_timer(self, name, next_ns)
+                yield name, next_ns
 
-    def skip_to(self, now_ns: int) -> int:
-        """Leave out what is due before ``now_ns``; return how many frames that would have been."""
-        skipped = 0
+    def skip_to(self, now_ns: int) -> Iterator[tuple[str, int]]:
+        """Leave out what is due before ``now_ns``; yield how often that would have been, by the name of the timer."""
         for name, (next_ns, period_ns) in self._timers.items():
             times = max(0, -((next_ns - now_ns) // period_ns))
             self._timers[name] = next_ns + times * period_ns, period_ns
-            skipped += self.stage.skipped(self, name, times)
-        return skipped
+            yield name, times

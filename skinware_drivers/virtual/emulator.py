@@ -9,20 +9,23 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
-from skinware_drivers.virtual.device import DATA, Actor, Device
+from skinware_drivers.virtual.device import DATA, Device
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.stage import OptionsT, Stage
 
 CanFrame = tuple[int, bytes]
 """Identifier and payload; an identifier of 29 bits has the flag, as in ``EXTENDED_FLAG | 0x18DA00F1``."""
+Places = npt.NDArray[np.float64]
+"""(n, 2) places of the values of a device, 0 to 1."""
 Source = Callable[[int, int], Sequence[int]]
 """(number of the device, number of its burst) -> the values that it sends, instead of felt ones."""
 
@@ -39,10 +42,10 @@ class WanderingPress:
 
     Args:
         number: of the device; devices with other numbers feel other presses.
-        places: (n, 2) of its sensors, 0 to 1.
+        places: of its sensors.
     """
 
-    def __init__(self, seed: int, number: int, places: npt.NDArray[np.float64]) -> None:
+    def __init__(self, seed: int, number: int, places: Places) -> None:
         random = np.random.default_rng([seed, number, 3])
         self._phase = random.uniform(0, 9)
         self._first_s = random.uniform(0, _PAUSE_S)
@@ -85,7 +88,7 @@ class Emulator(Stage[OptionsT]):
         swing: what a firm press adds to it.
     """
 
-    streams: ClassVar[Literal["on_command", "always", "never"]] = "on_command"
+    streams: Literal["on_command", "always", "never"] = "on_command"
     identifiers: Collection[int] = ()
     full_scale: int | Sequence[int]
     lowest: int | Sequence[int] = 0
@@ -101,8 +104,8 @@ class Emulator(Stage[OptionsT]):
     # A subclass defines these
 
     @abstractmethod
-    def places(self) -> npt.NDArray[np.float64]:
-        """Return (n, 2) places of a device's n values, 0 to 1; see :func:`on_a_grid`."""
+    def places(self) -> Places:
+        """Return the places of a device's values; see :func:`on_a_grid`."""
 
     @abstractmethod
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
@@ -127,8 +130,13 @@ class Emulator(Stage[OptionsT]):
         self.burst(device, time_ns)
 
     def kinds(self) -> Sequence[str]:
-        """Name the kinds of frames with data that the devices send, for the option ``silence``."""
-        return [self.kind_of(identifier, b"") for identifier in sorted(self.identifiers)]
+        """Name the kinds of frames with data, for the option ``silence``; by default those of a burst."""
+        values, found = self._each("rest").tolist(), dict[str, None]()
+        for device in self.devices.values():
+            trial = Device(device.number, deque(), device.ready_ns, self.options.seed)
+            trial.memory = dict(device.memory)
+            found |= dict.fromkeys(self.kind_of(*frame) for frame in self.frames(trial, values))
+        return list(found)
 
     # A subclass may use these
 
@@ -155,22 +163,19 @@ class Emulator(Stage[OptionsT]):
         """Send the values that are felt now; faults happen here."""
         device.sampled_ns = time_ns
         frames = self.frames(device, self._values(device, time_ns))
-        for frame in frames:
-            self.check_frame(frame)
+        if self.medium == "can":
+            for identifier, _ in frames:
+                check_identifier(identifier)
         self.send_burst(device, [frame[0] for frame in frames], [frame[1] for frame in frames], time_ns)
 
     # Within
 
-    def power_up(self, now_ns: int) -> Sequence[Actor]:
+    def power_up(self, now_ns: int) -> None:
         """Make the devices and everything else on the bus."""
         places = self.places()
         self._n_values = len(places)
         self._press = {number: WanderingPress(self.options.seed, number, places) for number in self.numbers}
-        return super().power_up(now_ns)
-
-    def check_frame(self, frame: CanFrame) -> None:
-        if self.medium == "can":
-            check_identifier(frame[0])
+        super().power_up(now_ns)
 
     def foreign_identifiers(self, random: np.random.Generator) -> Sequence[int]:
         others = np.setdiff1d(np.arange(0x7FF), np.array(sorted(self.identifiers)))
@@ -207,7 +212,7 @@ def each_value(name: str, given: int | Sequence[int], n_values: int) -> npt.NDAr
     return np.broadcast_to(numbers, n_values)
 
 
-def on_a_grid(count: int, columns: int, each: int = 1) -> npt.NDArray[np.float64]:
+def on_a_grid(count: int, columns: int, each: int = 1) -> Places:
     """Return (count * each, 2) places of sensors in rows, with ``each`` at the same place."""
     number = np.arange(count)
     rows = -(-count // columns)

@@ -12,7 +12,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import skinware.realtime
 from skinware.errors import PlatformError
@@ -25,16 +25,6 @@ _TFD_TIMER_ABSTIME = 1
 
 class _Itimerspec(ctypes.Structure):
     _fields_ = (("it_interval", Timespec), ("it_value", Timespec))
-
-
-class Timer(Protocol):
-    """A descriptor that becomes readable at a moment."""
-
-    def fileno(self) -> int: ...
-
-    def wake_at(self, time_ns: int | None) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class MonotonicTimer:
@@ -81,14 +71,6 @@ class MonotonicTimer:
             self._fd = -1
 
 
-class Clock(Protocol):
-    """CLOCK_MONOTONIC, or the time of a test. A call returns ns."""
-
-    def __call__(self) -> int: ...
-
-    def timer(self) -> Timer: ...
-
-
 class MonotonicClock:
     """CLOCK_MONOTONIC, ns."""
 
@@ -121,13 +103,14 @@ class HandClock:
     Attributes:
         before_passing: called before every jump, when everything of this moment has happened.
         turns: of the event loop so far.
+        timers: those that are open.
     """
 
     def __init__(self) -> None:
         self.now_ns: int = _BEGINNING_NS
         self.before_passing: list[Callable[[], object]] = []
         self.turns = 0
-        self._timers: set[HandTimer] = set()
+        self.timers: set[HandTimer] = set()
 
     def __call__(self) -> int:
         return self.now_ns
@@ -140,21 +123,14 @@ class HandClock:
     def timer(self) -> HandTimer:
         """Make a timer of this clock."""
         timer = HandTimer(self)
-        self._timers.add(timer)
+        self.timers.add(timer)
         return timer
-
-    def forget(self, timer: HandTimer) -> None:
-        self._timers.discard(timer)
-
-    def next_timer_ns(self) -> int | None:
-        due_ns = [timer.due_ns for timer in self._timers if timer.due_ns is not None and timer.due_ns > self.now_ns]
-        return min(due_ns, default=None)
 
     def pass_to(self, time_ns: int) -> None:
         for action in self.before_passing:
             action()
         self.now_ns = max(self.now_ns, time_ns)
-        for timer in list(self._timers):
+        for timer in list(self.timers):
             timer.look()
 
 
@@ -186,9 +162,15 @@ class HandTimer:
 
     def close(self) -> None:
         if self._fd >= 0:
-            self._clock.forget(self)
+            self._clock.timers.discard(self)
             os.close(self._fd)
             self._fd = -1
+
+
+Timer = MonotonicTimer | HandTimer
+"""A descriptor that becomes readable at a moment."""
+Clock = MonotonicClock | HandClock
+"""CLOCK_MONOTONIC, or the time of a test. A call returns ns."""
 
 
 class _PassingTime(selectors.EpollSelector):
@@ -208,10 +190,10 @@ class _PassingTime(selectors.EpollSelector):
         ready = super().select(0)
         if ready or (timeout is not None and timeout <= 0):
             return ready
-        moments = [] if timeout is None else [self._clock.now_ns + max(1, round(timeout * 1e9))]
-        timer_ns = self._clock.next_timer_ns()
-        if timer_ns is not None:
-            moments.append(timer_ns)
+        now_ns, due_ns = self._clock.now_ns, [timer.due_ns for timer in self._clock.timers]
+        moments = [time_ns for time_ns in due_ns if time_ns is not None and time_ns > now_ns]
+        if timeout is not None:
+            moments.append(now_ns + max(1, round(timeout * 1e9)))
         if not moments:  # only another thread can continue
             self._naps += 1
             if self._naps > _NAPS_WITHOUT_TIMER:

@@ -121,9 +121,13 @@ class EmulatedPort(Port):
         if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
             self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
         self._unread += self._hardware.emit(now_ns)
-        data = self._next_read(size)
+        if getattr(self._hardware, "datagrams", False):
+            data = self._unread.popleft().payload if self._unread else b""
+        else:
+            data = b"".join(frame.payload for frame in self._unread)
+            self._unread = deque([WireFrame(0, 0, data[size:])] if len(data) > size else ())
         self._wake_when_due()
-        return data
+        return data[:size]
 
     def write(self, data: bytes) -> int:
         if self._is_away:
@@ -138,14 +142,6 @@ class EmulatedPort(Port):
     def vanish(self) -> None:
         self._is_away = True
         self._timer.wake_at(0)
-
-    def _next_read(self, size: int) -> bytes:
-        """Return the bytes of one read: all that wait, or one datagram."""
-        if getattr(self._hardware, "datagrams", False):
-            return self._unread.popleft().payload[:size] if self._unread else b""
-        data = b"".join(frame.payload for frame in self._unread)
-        self._unread = deque([WireFrame(0, 0, data[size:])] if len(data) > size else ())
-        return data[:size]
 
     def _wake_when_due(self) -> None:
         self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())

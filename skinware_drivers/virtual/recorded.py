@@ -1,4 +1,4 @@
-"""The bus ``replay``: the recorded traffic of a wire as the bus of a driver.
+"""The buses ``replay`` and ``file``: the recorded or logged traffic of a wire as the bus of a driver.
 
 The driver decodes it with the recorded times, moved to now. An answer of a device comes when this driver has asked: at
 a frame that was sent, the recording waits until one with the same identifier is sent again. On Modbus the questions
@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol
 
 import msgspec
 
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import now_ns
+from skinware.wire import WireItem
 from skinware_drivers.bus import Bus, FrameBatch, chosen_by
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.counters import BusCounters, FramerCounters
@@ -30,10 +31,29 @@ from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.virtual.line import EmulatedLine, EmulatedPort
+from skinware_drivers.virtual.logs import LogFile
 from skinware_drivers.virtual.recorded_wire import SENT, Note, RecordedWire
 
 if TYPE_CHECKING:
-    from skinware.recording import Recording, WireItem, WireTrack
+    from skinware.recording import Recording
+
+
+_MCAP = b"\x89MCAP"
+
+
+class Wire(Protocol):
+    """A recorded bus: a :class:`skinware.recording.WireTrack`, or one of a log."""
+
+    @property
+    def driver(self) -> str: ...
+
+    @property
+    def bus(self) -> str: ...
+
+    @property
+    def is_serial(self) -> bool: ...
+
+    def items(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WireItem]: ...
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -248,7 +268,7 @@ _CLASSES: dict[str, type[Bus]] = {"serial": ReplayedSerialBus, "modbus": Replaye
 
 def _class_of(channel: str, options: dict[str, str]) -> type[Bus]:
     wanted = options_from_strings(ReplayOptions, options)
-    with _open(channel) as recording:
+    with _open(channel, wanted.bus) as recording:
         medium = medium_of(recording, wire_of(recording, wanted.bus, wanted.driver))
         return _CLASSES.get(medium, ReplayedCanBus)
 
@@ -263,7 +283,7 @@ def replayed_bus(
     clock: Clock = REAL_CLOCK,
     note: Note | None = None,
 ) -> Bus:
-    """Make the bus ``replay`` of a recorded bus in the file ``channel``.
+    """Make the bus ``replay`` or ``file`` of a bus in the file ``channel``, a recording or a log of another program.
 
     Args:
         options: see :class:`ReplayOptions`.
@@ -275,11 +295,11 @@ def replayed_bus(
     Raises:
         ConfigurationError: an option is unknown or has a bad value, the file cannot be read, or the options fit no bus
             or more than one.
-        BadRecording: the file is no recording.
+        BadRecording: the recording is damaged.
         MissingExtra: recordings need packages that are not installed.
     """
     wanted = options_from_strings(ReplayOptions, options or {})
-    recording = _open(channel)
+    recording = _open(channel, wanted.bus)
     wire = wire_of(recording, wanted.bus, wanted.driver)
     name = f"replay:{channel} ({wire.bus})"
     items = _items(recording, wire, wanted)
@@ -298,36 +318,40 @@ def recorded_driver(bus_name: str) -> Recorded:
     """Return the driver of the recorded bus that a bus' name means.
 
     Args:
-        bus_name: ``replay:FILE?key=value``.
+        bus_name: ``replay:FILE?key=value`` or ``file:FILE?key=value``.
 
     Raises:
         ConfigurationError, BadRecording, MissingExtra: as for :func:`replayed_bus`.
     """
     _, channel, options = parse_bus_name(bus_name)
     wanted = options_from_strings(ReplayOptions, options)
-    with _open(channel) as recording:
+    with _open(channel, wanted.bus) as recording:
         wire = wire_of(recording, wanted.bus, wanted.driver)
         about = recording.about(wire.driver)
         own = about.get("buses", {}).get(wire.bus, {}).get("options", {})
         return Recorded(str(about.get("driver_type", "")), bool(about.get("listen_only")), dict(own))
 
 
-def _open(path: str) -> Recording:
-    import skinware.recording
-
+def _open(path: str, bus: str) -> Recording | LogFile:
+    """Open a recording, or a log with such a bus in it."""
     try:
+        with open(path, "rb") as file:
+            if not file.read(len(_MCAP)).startswith(_MCAP):
+                return LogFile(path, bus)
+        import skinware.recording
+
         return skinware.recording.open(path)
     except OSError as error:
         raise ConfigurationError(f"{path}: {error.strerror}") from None
 
 
-def medium_of(recording: Recording, wire: WireTrack) -> str:
+def medium_of(recording: Recording | LogFile, wire: Wire) -> str:
     """Return ``can``, ``serial`` or ``modbus``: of the recorded driver, else by the recorded items."""
     known = recording.about(wire.driver).get("buses", {}).get(wire.bus, {}).get("medium")
     return str(known or ("serial" if wire.is_serial else "can"))
 
 
-def first_of(wires: Sequence[WireTrack], start_s: float = 0.0) -> int:
+def first_of(wires: Sequence[Wire], start_s: float = 0.0) -> int:
     """Return the time of the first item on any of these wires, in the recording's CLOCK_MONOTONIC ns; 0: none.
 
     Args:
@@ -337,13 +361,13 @@ def first_of(wires: Sequence[WireTrack], start_s: float = 0.0) -> int:
     return min((first.time_ns for first in firsts if first is not None), default=0)
 
 
-def _items(recording: Recording, wire: WireTrack, wanted: ReplayOptions) -> Iterator[WireItem]:
+def _items(recording: Recording | LogFile, wire: Wire, wanted: ReplayOptions) -> Iterator[WireItem]:
     """Yield the wanted items of a wire, then close the recording."""
     with recording:
         yield from wire.items(start_s=wanted.start, end_s=wanted.end)
 
 
-def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
+def wire_of(recording: Recording | LogFile, bus: str = "", driver: str = "") -> Wire:
     """Return a recorded wire.
 
     Args:
@@ -359,7 +383,7 @@ def wire_of(recording: Recording, bus: str = "", driver: str = "") -> WireTrack:
     found = [wire for wire in wires if bus in ("", wire.bus) and driver in ("", wire.driver)]
     if len(found) == 1:
         return found[0]
-    there_are = ", ".join(f"bus={wire.bus}&driver={wire.driver}" for wire in wires)
+    there_are = ", ".join(f"bus={wire.bus}&driver={wire.driver}".removesuffix("&driver=") for wire in wires)
     of_driver = f" of {driver}" if driver else ""
     what = "which bus?" if found else f"no bus {bus}{of_driver};"
     raise ConfigurationError(f"{recording.path}: {what} there are: {there_are}")

@@ -31,16 +31,22 @@ _MOST_QUESTIONS = 1000
 class Questions:
     """The questions of this driver, by identifier, and the recorded ones that they meet.
 
+    Args:
+        waits: recorded questions are waited for.
+
     Attributes:
         last_ns: when this driver asked last.
+        is_unanswered: the answer to the last question that met a recorded one has not come.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, waits: bool) -> None:
+        self._waits = waits
         self.last_ns = 0
+        self.is_unanswered = False
         self._asked: dict[int, deque[tuple[int, bytes]]] = {}
         self._answered: dict[int, bytes] = {}
         self._given_up: set[int] = set()
-        self._met_ns, self._is_unanswered = 0, False
+        self._met_ns = 0
 
     def ask(self, identifier: int, payload: bytes, now_ns: int) -> None:
         self.last_ns = now_ns
@@ -59,26 +65,20 @@ class Questions:
         return asked
 
     def is_awaited(self, item: WireItem) -> bool:
-        return item.is_sent and (item.identifier or 0) not in self._given_up
+        return self._waits and item.is_sent and (item.identifier or 0) not in self._given_up
 
     def meet(self, item: WireItem, now_ns: int) -> int:
         """Let the first question like a recorded one meet it; return when it was asked."""
         asked_ns, self._answered[item.identifier or 0] = self.like(item).popleft()
-        self._met_ns, self._is_unanswered = now_ns, True
+        self._met_ns, self.is_unanswered = now_ns, True
         return asked_ns
 
     def give_up(self, item: WireItem) -> None:
         self._given_up.add(item.identifier or 0)
 
-    def answered(self) -> None:
-        self._is_unanswered = False
-
     def is_missed(self, item: WireItem) -> bool:
         """Return whether an item is the answer to a question after which this driver has asked again already."""
-        return not item.is_sent and self._is_unanswered and self.last_ns > self._met_ns
-
-    def is_answered_by(self, item: WireItem | None) -> bool:
-        return self._is_unanswered and item is not None and not item.is_sent
+        return not item.is_sent and self.is_unanswered and self.last_ns > self._met_ns
 
 
 class RecordedWire:
@@ -107,9 +107,9 @@ class RecordedWire:
         name: str = "",
         note: Note | None = None,
     ) -> None:
-        self._items, self._first_ns, self._speed, self._waits = items, first_ns, speed, waits
+        self._items, self._first_ns, self._speed = items, first_ns, speed
         self._with_sent, self._name, self._note = with_sent, name, note
-        self._questions = Questions()
+        self._questions = Questions(waits=waits)
         self._next: WireItem | None = None
         self._begun_ns = self._given_ns = self._looked_ns = 0
         self._has_begun = self.is_over = False
@@ -126,7 +126,7 @@ class RecordedWire:
         if item is None or not self._has_begun:
             return None
         due_ns = self._due_ns(item)
-        if not self._is_waited_for(item):
+        if not self._questions.is_awaited(item):
             return min(due_ns, self._questions.last_ns) if self._questions.is_missed(item) else due_ns
         asked = self._questions.like(item)
         if not asked:
@@ -139,15 +139,16 @@ class RecordedWire:
         self._looked_ns = now_ns
         while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._hurry(item, now_ns)):
             if item.is_sent:
-                if self._is_waited_for(item) and not self._is_asked(item, now_ns):
+                if self._questions.is_awaited(item) and not self._is_asked(item, now_ns):
                     break
                 if self._with_sent:
                     found.append(self._given(item, SENT))
             elif item.identifier is None or not item.identifier & (ERROR_FLAG | REMOTE_FLAG):
                 found.append(self._given(item, item.identifier or 0))
-                self._questions.answered()
+                self._questions.is_unanswered = False
             self._take_next()
-            if item.is_sent and self._next is not None and self._questions.is_answered_by(self._next):
+            is_answer = self._next is not None and not self._next.is_sent and self._questions.is_unanswered
+            if item.is_sent and self._next is not None and is_answer:
                 # the recording driver waited for this answer, however late it read it; this one need not wait so long
                 later_ns = self._due_ns(self._next) - self._due_ns(item)
                 self._begun_ns -= max(0, later_ns - _ANSWERED_WITHIN_NS)
@@ -174,9 +175,6 @@ class RecordedWire:
             self._note(self._given_ns, item.time_ns)
         return WireFrame(self._given_ns, identifier, item.data)
 
-    def _is_waited_for(self, item: WireItem) -> bool:
-        return self._waits and self._questions.is_awaited(item)
-
     def _is_asked(self, item: WireItem, now_ns: int) -> bool:
         """Return whether a question was asked, or is waited for no more; a late one delays all that follows."""
         due_ns, asked = self._due_ns(item), self._questions.like(item)
@@ -201,7 +199,7 @@ class RecordedWire:
         if self._questions.is_missed(item):
             self._begun_ns -= max(0, self._due_ns(item) - self._questions.last_ns)
             return True
-        asked = self._questions.like(item) if self._is_waited_for(item) else None
+        asked = self._questions.like(item) if self._questions.is_awaited(item) else None
         if not asked or asked[0][1] != item.data or asked[0][0] < now_ns - _EARLIEST_NS:
             return False
         self._begun_ns -= self._due_ns(item) - asked[0][0]

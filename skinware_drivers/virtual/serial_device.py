@@ -84,8 +84,8 @@ class SerialEmulator(Emulator[OptionsT]):
         return "data"
 
     def kinds(self) -> Sequence[str]:
-        """Name the kinds of messages with data; by default there is one."""
-        return ["data"]
+        """Name the kinds of messages with data: those of a burst, or ``data`` of devices that only answer."""
+        return ["data"] if self.streams == "never" else super().kinds()
 
     # Within
 
@@ -177,7 +177,7 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
 
     def kinds(self) -> Sequence[str]:
         """Name the registers with data; a question for a silent one gets no answer."""
-        device = Device(self.numbers[0], self, self.wire.attach(), 0)
+        device = next(iter(self.devices.values()))
         return [str(address) for address in sorted(self.registers(device, self._each("rest").tolist()))]
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
@@ -204,11 +204,12 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
             if not self.silent.isdisjoint(map(str, wanted)):
                 self.counts["silenced"] += 1
                 return b""
-            if self._is_to_sample(device, wanted):
+            sample = device.memory.get(_SAMPLE)
+            if min(sample) in wanted if sample else not set(wanted) <= set(self.beside(device)):
                 device.memory[_ASKED] = asked
                 self.burst(device, now_ns)
                 return b""
-            return _read_from({**self.beside(device), **device.memory.get(_SAMPLE, {})}, asked, self.step)
+            return _read_from({**self.beside(device), **(sample or {})}, asked, self.step)
         if function in _READS and 1 <= count <= _MOST_READ and (others := self.of_other_function(device)):
             return _read_from(others, asked, self.step)
         if function in (_WRITE_ONE, _WRITE_MANY):
@@ -219,11 +220,6 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         """Take a new sample; return the answer to the question that asked for it."""
         device.memory[_SAMPLE] = self.registers(device, values)
         return [_read_from({**self.beside(device), **device.memory[_SAMPLE]}, device.memory[_ASKED], self.step)]
-
-    def _is_to_sample(self, device: Device, wanted: range) -> bool:
-        if _SAMPLE in device.memory:
-            return min(device.memory[_SAMPLE]) in wanted
-        return not set(wanted) <= set(self.beside(device))
 
     def _write(self, device: Device, asked: _Asked, address: int) -> bytes:
         message = asked.message

@@ -9,14 +9,16 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from operator import itemgetter
 from typing import ClassVar, TypeVar
 
 import msgspec
 import numpy as np
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.bus import check_identifier
 from skinware_drivers.options import HasOptions
-from skinware_drivers.virtual.device import DATA, Actor, Device, EmulatorOptions, Scheduled
+from skinware_drivers.virtual.device import DATA, Device, EmulatorOptions
 from skinware_drivers.virtual.events import Event, FrameDamage
 from skinware_drivers.virtual.hardware import EventLog, WireFrame
 from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Wire
@@ -70,8 +72,8 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.counts: dict[str, int] = dict.fromkeys(counted, 0)
         self.silent: set[str] = set()
         self.devices: dict[int, Device] = {}
-        self._actors: list[Actor] = []
-        self._scheduled: list[Scheduled] = []
+        self._foreign: ForeignTraffic | None = None
+        self._scheduled: list[tuple[int, Callable[[int], object]]] = []
         self._now_ns: int | None = None
         self._event_ns: int | None = None
         for name in ("dead", "restart", "faulty"):
@@ -107,14 +109,15 @@ class Stage(ABC, HasOptions[OptionsT]):
         return f"0x{identifier & _IDENTIFIER_MASK:03x}"
 
     def make_device(self, number: int, now_ns: int) -> Device:
-        return Device(number, self, self.wire.attach(), now_ns)
+        return Device(number, self.wire.attach(), now_ns, self.options.seed)
 
     # A subclass may use these
 
     def reply(self, device: Device, frame: tuple[int, bytes], now_ns: int) -> None:
         """Send one frame besides the data."""
-        self.check_frame(frame)
-        device.transmitter.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
+        if self.medium == "can":
+            check_identifier(frame[0])
+        device.queue.append(Transmission(now_ns + _REPLY_NS, [frame[0]], [frame[1]]))
 
     def send_burst(
         self,
@@ -131,15 +134,20 @@ class Stage(ABC, HasOptions[OptionsT]):
             time_ns: when they are ready, unless the option ``jitter_us`` delays them.
             usual: all have 8 bytes and 11-bit identifiers.
         """
-        ready_ns = time_ns + self._delay_ns(device, time_ns)
+        ready_ns = time_ns
+        if self.options.jitter_us:
+            ready_ns += int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
+        if ready_ns > time_ns:
+            delay_ns = ready_ns - time_ns
+            late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
+            self.log.append(late)
         chances = [getattr(self.options, name) for name in self.frame_faults]
         lost: set[int] = set()
-        if any(chances) or len(device.transmitter) + len(identifiers) > self.longest_queue:
+        if any(chances) or sum(map(len, device.queue)) + len(identifiers) > self.longest_queue:
             identifiers, payloads, lost = self._with_faults(device, identifiers, payloads, time_ns, chances)
             usual = usual and all(len(payload) == 8 for payload in payloads)
         if identifiers:
-            burst = Transmission(ready_ns, identifiers, payloads, lost, usual=usual, cycle=device.cycle)
-            device.transmitter.queue.append(burst)
+            device.queue.append(Transmission(ready_ns, identifiers, payloads, lost, usual=usual, cycle=device.cycle))
         device.cycle += 1
         self.counts["bursts"] += 1
 
@@ -158,14 +166,14 @@ class Stage(ABC, HasOptions[OptionsT]):
 
     def schedule(self, time_ns: int, action: Callable[[int], object]) -> None:
         """Call ``action`` with the time when it has come."""
-        self._scheduled.append(Scheduled(time_ns, action))
-        self._scheduled.sort(key=lambda scheduled: scheduled.time_ns)
+        self._scheduled.append((time_ns, action))
+        self._scheduled.sort(key=itemgetter(0))
 
     def run_to(self, now_ns: int) -> int:
         """Bring everything to ``now_ns``, in order of time; return the time that holds, which never goes back."""
         if self._now_ns is None:
             self._now_ns = now_ns
-            self._actors = list(self.power_up(now_ns))
+            self.power_up(now_ns)
             self.find_next_event()
         self._now_ns = now_ns = max(now_ns, self._now_ns)
         while True:
@@ -174,17 +182,23 @@ class Stage(ABC, HasOptions[OptionsT]):
                 self.wire.run(now_ns + 1)
                 return now_ns
             self.wire.run(event_ns)
-            while self._scheduled and self._scheduled[0].time_ns <= event_ns:
-                self._scheduled.pop(0).action(event_ns)
-            for actor in self._actors:
-                actor.run(event_ns)
+            while self._scheduled and self._scheduled[0][0] <= event_ns:
+                _, action = self._scheduled.pop(0)
+                action(event_ns)
+            for device in self.devices.values():
+                for name, time_ns in device.due(event_ns):
+                    self.on_timer(device, name, time_ns)
+            if self._foreign is not None:
+                self._foreign.run(event_ns)
             self.find_next_event()
 
     def find_next_event(self) -> None:
         """Look up the next event again, after a device may have changed its timers."""
-        times_ns = [time_ns for actor in self._actors if (time_ns := actor.next_event_ns()) is not None]
+        times_ns = [time_ns for one in self.devices.values() if (time_ns := one.next_event_ns()) is not None]
+        if self._foreign is not None:
+            times_ns.append(self._foreign.next_event_ns)
         if self._scheduled:
-            times_ns.append(self._scheduled[0].time_ns)
+            times_ns.append(self._scheduled[0][0])
         self._event_ns = min(times_ns, default=None)
 
     # Faults at a moment of the caller's choice
@@ -249,8 +263,12 @@ class Stage(ABC, HasOptions[OptionsT]):
         """Let the devices run on without a listener; return the number of frames that went unheard."""
         unheard = 0
         if self._now_ns is not None and now_ns - self._now_ns > _LONGEST_CATCH_UP_NS:
-            self.wire.run(now_ns - _LONGEST_CATCH_UP_NS)
-            unheard += sum(actor.skip_to(now_ns - _LONGEST_CATCH_UP_NS) for actor in self._actors)
+            until_ns = now_ns - _LONGEST_CATCH_UP_NS
+            self.wire.run(until_ns)
+            for device in self.devices.values():
+                unheard += sum(self.skipped(device, name, times) for name, times in device.skip_to(until_ns))
+            if self._foreign is not None:
+                unheard += self._foreign.skip_to(until_ns)
             self.find_next_event()
         self.run_to(now_ns)
         unheard += len(self.wire.heard)
@@ -264,7 +282,7 @@ class Stage(ABC, HasOptions[OptionsT]):
 
     # Within
 
-    def power_up(self, now_ns: int) -> Sequence[Actor]:
+    def power_up(self, now_ns: int) -> None:
         """Make the devices and everything else on the bus.
 
         Raises:
@@ -280,19 +298,17 @@ class Stage(ABC, HasOptions[OptionsT]):
         for number in options.restart:
             restart = partial(self.lose_power_for_a_moment, self.devices[number])
             self.schedule(now_ns + round(options.restart_after_s * 1e9), restart)
-        known = self.kinds()
+        known = self.kinds() if options.silence else ()
         for kind in options.silence:
             if kind not in known:
                 listed = ", ".join([*known[:_MOST_LISTED], *(["..."] if len(known) > _MOST_LISTED else [])])
                 raise ConfigurationError(f"option silence: {kind!r} is no kind of frame; there are {listed}")
         silence_ns = now_ns + round(options.silence_after_s * 1e9)
         self.schedule(silence_ns, lambda _: self.silent.update(options.silence))
-        actors: list[Actor] = [*self.devices.values()]
         if options.foreign_hz:
             random = np.random.default_rng([options.seed, 2])
-            identifiers, place = self.foreign_identifiers(random), self.wire.attach()
-            actors.append(ForeignTraffic(identifiers, options.foreign_hz, random, place, self.log, self.counts, now_ns))
-        return actors
+            others, queue = self.foreign_identifiers(random), self.wire.attach()
+            self._foreign = ForeignTraffic(others, options.foreign_hz, random, queue, self.log, self.counts, now_ns)
 
     def dying(self) -> Sequence[int]:
         """Return the devices that die at the time of the option ``dead_after_s``."""
@@ -308,9 +324,6 @@ class Stage(ABC, HasOptions[OptionsT]):
     def die(self, device: Device, now_ns: int) -> None:
         self._lose_power(device, now_ns, "died")
         self.log.append(Event("board_died", now_ns, board=device.number))
-
-    def check_frame(self, frame: tuple[int, bytes]) -> None:
-        """Refuse a frame that the medium cannot carry."""
 
     def skipped(self, device: Device, name: str, times: int) -> int:
         """Count what a timer would have done ``times``; return how many frames that would have been."""
@@ -350,15 +363,6 @@ class Stage(ABC, HasOptions[OptionsT]):
             )
         )
 
-    def _delay_ns(self, device: Device, time_ns: int) -> int:
-        if not self.options.jitter_us:
-            return 0
-        delay_ns = int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
-        if delay_ns:
-            late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
-            self.log.append(late)
-        return delay_ns
-
     def _with_faults(
         self,
         device: Device,
@@ -375,7 +379,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         lost: set[int] = set()
         for position, (identifier, whole) in enumerate(zip(identifiers, payloads, strict=True)):
             fault: FrameDamage | None = faults[int(hit[position].argmax())] if hit[position].any() else None
-            if len(device.transmitter) + len(sent_as) >= self.longest_queue:
+            if sum(map(len, device.queue)) + len(sent_as) >= self.longest_queue:
                 fault = "unsent"
             payload = whole
             if fault is not None:
@@ -391,10 +395,10 @@ class Stage(ABC, HasOptions[OptionsT]):
 
     def _lose_power(self, device: Device, now_ns: int, reason: str) -> None:
         device.alive = False
-        for burst in device.transmitter.queue:
+        for burst in device.queue:
             for at in range(burst.sent, len(burst.identifiers)):
                 if burst.cycle >= 0 and at not in burst.lost:
                     frame = burst.identifiers[at], burst.payloads[at]
                     self.note_fault(device, now_ns, (burst.cycle, at), frame, "unsent", reason)
-        device.transmitter.queue.clear()
+        device.queue.clear()
         device.clear()

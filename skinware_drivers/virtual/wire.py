@@ -58,18 +58,8 @@ class Transmission:
         return len(self.identifiers) - self.sent
 
 
-class Transmitter:
-    """The transmit queue of one device."""
-
-    def __init__(self) -> None:
-        self.queue: deque[Transmission] = deque()
-
-    def __len__(self) -> int:
-        return sum(map(len, self.queue))
-
-
 class Wire:
-    """The wire that the transmitters share.
+    """The wire that the queues of all devices share.
 
     Attributes:
         heard: frames that went over the wire and were not fetched yet, oldest first.
@@ -78,7 +68,7 @@ class Wire:
 
     def __init__(self) -> None:
         self.speed = 1
-        self.transmitters: list[Transmitter] = []
+        self._queues: list[deque[Transmission]] = []
         self.heard: list[WireFrame] = []
         self._free_ns = 0
         self._busy_ns = 0
@@ -91,20 +81,21 @@ class Wire:
     def bits(self) -> float:
         return self._busy_ns * self.speed / _BIT_NS
 
-    def attach(self) -> Transmitter:
-        transmitter = Transmitter()
-        self.transmitters.append(transmitter)
-        return transmitter
+    def attach(self) -> deque[Transmission]:
+        """Return the queue of a new device."""
+        queue: deque[Transmission] = deque()
+        self._queues.append(queue)
+        return queue
 
     def next_start_ns(self) -> int | None:
         """Return the time at which the next frame begins; None while none waits."""
-        ready_ns = [transmitter.queue[0].ready_ns for transmitter in self.transmitters if transmitter.queue]
+        ready_ns = [queue[0].ready_ns for queue in self._queues if queue]
         return max(self._free_ns, min(ready_ns)) if ready_ns else None
 
     def run(self, until_ns: int) -> None:
         """Send the frames that begin before ``until_ns``, assuming that no more are queued."""
         while True:
-            waiting = [transmitter.queue for transmitter in self.transmitters if transmitter.queue]
+            waiting = [queue for queue in self._queues if queue]
             if not waiting:
                 return
             start_ns = max(self._free_ns, min([queue[0].ready_ns for queue in waiting]))
@@ -164,37 +155,34 @@ class ForeignTraffic:
         identifiers: Sequence[int],
         rate_hz: float,
         random: np.random.Generator,
-        transmitter: Transmitter,
+        queue: deque[Transmission],
         log: EventLog,
         counts: dict[str, int],
         now_ns: int,
     ) -> None:
         self._random = random
         self._pause_ns = 1e9 / rate_hz
-        self._transmitter, self._log, self._counts = transmitter, log, counts
+        self._queue, self._log, self._counts = queue, log, counts
         self._identifiers = identifiers
-        self._next_ns = now_ns
+        self.next_event_ns = now_ns
         self._wait()
 
     def _wait(self) -> None:
-        self._next_ns += 1 + int(self._random.exponential(self._pause_ns))
-
-    def next_event_ns(self) -> int:
-        return self._next_ns
+        self.next_event_ns += 1 + int(self._random.exponential(self._pause_ns))
 
     def run(self, now_ns: int) -> None:
-        while self._next_ns <= now_ns:
+        while self.next_event_ns <= now_ns:
             identifier = self._identifiers[int(self._random.integers(len(self._identifiers)))]
             payload = self._random.bytes(int(self._random.integers(0, 8, endpoint=True)))
-            self._transmitter.queue.append(Transmission(self._next_ns, [identifier], [payload]))
+            self._queue.append(Transmission(self.next_event_ns, [identifier], [payload]))
             self._counts["foreign"] += 1
-            self._log.append(Event("foreign_frame", self._next_ns, identifier=identifier, length=len(payload)))
+            self._log.append(Event("foreign_frame", self.next_event_ns, identifier=identifier, length=len(payload)))
             self._wait()
 
     def skip_to(self, now_ns: int) -> int:
         """Leave out what is due before ``now_ns``; return how many frames that would have been, on average."""
-        missed_ns = now_ns - self._next_ns
+        missed_ns = now_ns - self.next_event_ns
         if missed_ns <= 0:
             return 0
-        self._next_ns = now_ns
+        self.next_event_ns = now_ns
         return 1 + int(missed_ns / self._pause_ns)

@@ -19,12 +19,12 @@ from skinware.cli.calibrate import command
 from skinware.geometry import Geometry, geometry_to_toml, read_geometry
 from skinware.sensor_types import PRESSURE
 from skinware.tactile.calibration.state import ForceSession, PressSession, StrokeSession, save_session
-from skinware.tactile.calibration.topology import StrokeSums
+from skinware.tactile.calibration.topology import ENOUGH_FRAMES, StrokeSums
 from skinware.tactile.curves import read_curves
 from skinware.tactile.testing import Surface, triangles
-from skinware.tactile.testing.probe import Probe
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, publishing
+from tests.cli.probe import Probe
 from tests.commands import run, running
 from tests.tactile.calibrating import off_m, presses, stroked
 
@@ -163,7 +163,7 @@ def test_a_probe_a_driver_and_the_truth(tmp_path: Path, capsys: pytest.CaptureFi
 def test_topology_from_strokes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "map.toml"
     surface, sums = strokes()
-    covered, known = sums.covered, sums.known
+    covered, known = sums.active >= ENOUGH_FRAMES, sums.known
     assert covered.mean() > 0.95
     with publishing(calm_skin(surface)) as skin:
         stroked_state(file, skin.structure)

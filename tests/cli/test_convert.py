@@ -182,3 +182,43 @@ def test_it_offers_what_there_is() -> None:
     assert set(_LEARNING_FORMATS) == set(LEARNING_FORMATS)
     assert set(_FORMATS) == set(FORMATS)
     assert set(_WIRE_FORMATS) == set(WIRE_FORMATS)
+
+
+def test_data_of_other_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("skinware.cli.convert._PROGRESS_S", 0)
+    rows = "".join(f"{number / 100},{number},{2 * number}\n" for number in range(30))
+    Path("data.csv").write_text(f"time,taxel_0,taxel_1\n{rows}")
+    assert exit_status(convert, ["data.csv", "--guess"]) == 0
+    Path("map.toml").write_text(capsys.readouterr().out)
+    assert exit_status(convert, ["data.csv", "--map", "map.toml", "--to", "mcap", "-o", "made.mcap", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["frames"] == {"data": 30}
+    assert err == "skin-convert: data.csv: 100%\n"
+    assert exit_status(convert, ["data.csv", "--map", "map.toml", "--to", "npz"]) == 0
+    with np.load("data.npz") as arrays:
+        assert arrays["data/columns/values"].tolist() == [[number, 2 * number] for number in range(30)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "Missing option '--to'"),
+        (["--guess", "--to", "mcap"], "--guess goes without --to"),
+        (["--map", "map.toml", "--to", "mcap", "--start", "3"], "--map goes without --start"),
+        (["--map", "map.toml", "--to", "lerobot"], "then convert the recording to lerobot"),
+        (["--map", "map.toml", "--to", "mcap"], "data.csv: No such file or directory"),
+    ],
+)
+def test_mistakes_with_data_of_other_programs(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert exit_status(convert, ["data.csv", *arguments]) == 2
+    assert words in capsys.readouterr().err

@@ -37,6 +37,7 @@ from skinware_drivers.serial.weiss_wts import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.streams.dex3 import Dex3Driver
 from skinware_drivers.streams.icub_eth import IcubEthDriver
+from skinware_drivers.streams.ros2 import Ros2Driver
 from skinware_drivers.streams.tesollo import TesolloDriver
 from skinware_drivers.streams.xela_server import XelaServerDriver
 from skinware_drivers.streams.yarp import YarpDriver
@@ -62,6 +63,7 @@ from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3
 from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf
+from skinware_drivers.virtual.devices.ros2 import EmulatedRos2
 from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
 from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
@@ -307,6 +309,38 @@ class TestYarpOfARobotsFiles(DriverConformance):
         "triangles": [{"board": 7, "first": 0, "triangles": [0, 1, 2, 3], "kind": "fingertip"}],
     }
     emulator_options: ClassVar[Mapping[str, Any]] = {"length": 48}
+
+
+class TestRos2(DriverConformance):
+    """Two topics of arrays."""
+
+    driver = Ros2Driver
+    emulator = EmulatedRos2
+    driver_options: ClassVar[Mapping[str, Any]] = {"topic": ("/left", "/right")}
+    emulator_options: ClassVar[Mapping[str, Any]] = {"topics": (0, 1)}
+
+
+@pytest.mark.thorough
+class TestRos2Image(DriverConformance):
+    driver = Ros2Driver
+    emulator = EmulatedRos2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"message": "image"}
+
+
+@pytest.mark.thorough
+class TestRos2Points(DriverConformance):
+    driver = Ros2Driver
+    emulator = EmulatedRos2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"message": "points"}
+
+
+@pytest.mark.thorough
+class TestRos2Sensors(DriverConformance):
+    """Two modules of one message."""
+
+    driver = Ros2Driver
+    emulator = EmulatedRos2
+    emulator_options: ClassVar[Mapping[str, Any]] = {"message": "sensors"}
 
 
 class TestIcubEth(DriverConformance):

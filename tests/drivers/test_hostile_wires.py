@@ -83,7 +83,7 @@ CASES = {
         ("ability_hand", "agni", "anyskin", "flexitac", "openpatch", "paxini", "skintalk", "tactile_glove"),
         _LINE,
     ),
-    **dict.fromkeys(("dex3", "robotiq_tsf", "weiss_dsa", "weiss_wts", "wuji_glove"), _LINE),
+    **dict.fromkeys(("dex3", "robotiq_tsf", "ros2", "weiss_dsa", "weiss_wts", "wuji_glove"), _LINE),
     "dfrobot": Case(_modbus_line),
     "inspire": Case(_modbus_tcp),
     "revo2": Case(_modbus_line),

@@ -55,6 +55,7 @@ ROWS = (
     Row("roboskin", "0x470-tail", 12, 768, "live", "orphans"),  # the second half of a triangle
     Row("robotiq_tsf", "temperature0", 1, 78, "live", ""),  # a field of a finger
     Row("robotiq_tsf", "static1", 28, 78, "live", ""),  # the taxels of the other
+    Row("ros2", "topic0", 24, 48, "stale", ""),  # the messages of a topic
     Row("skintalk", "0x10", 1, 24, "live", ""),  # the record of a cell
     Row("tactile_glove", "0x3c", 1, 64, "live", ""),  # the packet of a taxel
     Row("tesollo", "data", 75, 75, "restarted", "polls_unanswered"),  # the answers with data

@@ -17,7 +17,8 @@ from skinware.errors import BadRecording
 from skinware.recording import Recording
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import Channels
-from skinware.recording.wire import SERIAL, SERIAL_HEADER, SOCKETCAN, Chosen, export_candump, export_pcapng
+from skinware.recording.wire import Chosen, export_candump, export_pcapng
+from skinware.wire import SERIAL, SERIAL_HEADER, SOCKETCAN
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG
 from skinware_drivers.wire_tap import WireTap
 

@@ -339,8 +339,11 @@ def test_files_that_cannot_be_replayed(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="No such file"):
         make_bus(f"replay:{tmp_path}/nothing.mcap")
     (tmp_path / "text").write_text("text")
-    with pytest.raises(BadRecording, match="not a recording"):
+    with pytest.raises(ConfigurationError, match=r"no log of a CAN bus: .* are read, recordings too"):
         make_bus(f"replay:{tmp_path}/text")
+    (tmp_path / "bad.mcap").write_bytes(b"\x89MCAP" + bytes(100))
+    with pytest.raises(BadRecording, match="not a recording"):
+        make_bus(f"replay:{tmp_path}/bad.mcap")
     write_recording(tmp_path / "without.mcap", lambda taps: None)
     with pytest.raises(ConfigurationError, match="no wire was recorded: skin-record --wire records them"):
         make_bus(f"replay:{tmp_path}/without.mcap")

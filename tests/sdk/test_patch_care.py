@@ -23,12 +23,6 @@ from skinware_drivers.running.patch_care import PatchCare
 PATCHES = [Patch(f"patch {key}", [Module(taxels(1, first_uid=key))], key=key) for key in range(8)]
 
 
-def set_clock(monkeypatch: pytest.MonkeyPatch, clock: Callable[[], int]) -> None:
-    """Let patches be looked after in this time, and their set-ups be due in it."""
-    for module in (guard, patch_care):
-        monkeypatch.setattr(module, "now_ns", clock)
-
-
 class Silent(CanAdapter[NoOptions]):
     """Many patches on one bus that cannot be asked, and can only be set up all at once."""
 
@@ -117,7 +111,8 @@ def test_silent_patches_that_can_only_be_set_up_together_are_so_once(
         assert adapter.set_ups == set_ups
         assert stage.forgotten == ([] if kind is Silent else list(range(8)))
         later_ns = now_ns() + NS_PER_S
-        set_clock(monkeypatch, lambda: later_ns)
+        monkeypatch.setattr(guard, "now_ns", lambda: later_ns)
+        monkeypatch.setattr(patch_care, "now_ns", lambda: later_ns)
         await stage.care.recover_silent()  # the next time it is tried again
         assert adapter.set_ups == 2 * set_ups
 
@@ -128,7 +123,8 @@ def test_a_patch_that_stays_away_has_the_living_ones_disturbed_more_and_more_rar
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock_ns = 1000 * NS_PER_S
-    set_clock(monkeypatch, lambda: clock_ns)
+    monkeypatch.setattr(guard, "now_ns", lambda: clock_ns)
+    monkeypatch.setattr(patch_care, "now_ns", lambda: clock_ns)
     adapter = Silent(fails=False)
     stage = Stage(adapter)
     stage.states = {key: PatchState.STALE if key == 3 else PatchState.LIVE for key in stage.states}
@@ -162,7 +158,8 @@ def test_a_patch_that_answers_but_sends_nothing_is_set_up_more_and_more_rarely(
 ) -> None:
     """Each set-up moves its baseline; and on a full bus it is most likely in order, and its frames find no room."""
     clock_ns = 1000 * NS_PER_S
-    set_clock(monkeypatch, lambda: clock_ns)
+    monkeypatch.setattr(guard, "now_ns", lambda: clock_ns)
+    monkeypatch.setattr(patch_care, "now_ns", lambda: clock_ns)
     adapter = OneByOne(fails=False)
     stage = Stage(adapter, is_full=is_full)
     stage.states = {key: PatchState.STALE if key == 3 else PatchState.LIVE for key in stage.states}

@@ -19,12 +19,14 @@ from skinware_drivers.serial.stream import PythonStream
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _Matrix
 from skinware_drivers.streams.dex3 import Dex3Driver, Dex3Options
 from skinware_drivers.streams.icub_eth import rops
+from skinware_drivers.streams.ros2 import Ros2Driver, Ros2Options
 from skinware_drivers.streams.tesollo import TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.streams.xela_server import XelaMessages
 from skinware_drivers.streams.yarp_messages import YarpMessages
 from skinware_drivers.virtual.devices.dex3 import EmulatedDex3, EmulatedDex3Options
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
 from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf, EmulatedRobotiqTsfOptions
+from skinware_drivers.virtual.devices.ros2 import EmulatedRos2, EmulatedRos2Options
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa, EmulatedWeissDsaOptions, message
 from skinware_drivers.virtual.devices.xela import EmulatedXelaServer, EmulatedXelaServerOptions
@@ -60,6 +62,17 @@ def _dex3() -> tuple[Framing, list[bytes]]:
     return Dex3Driver(Dex3Options()).framing, Spoken(EmulatedDex3(EmulatedDex3Options())).answers(b"", 100)
 
 
+def _ros2() -> tuple[Framing, list[bytes]]:
+    driver, told = Ros2Driver(Ros2Options()), list[bytes]()
+    for kind in ("array", "image", "points", "sensors"):
+        told += Spoken(EmulatedRos2(EmulatedRos2Options(message=kind))).answers(b"", 500)
+    for sample in driver.framing.framer().feed(b"".join(told)):
+        assert sample.identifier == 0  # news
+    driver._collect()
+    driver._describe()
+    return driver.framing, told
+
+
 def _robotiq() -> tuple[Framing, list[bytes]]:
     fingertips = Spoken(EmulatedRobotiqTsf(EmulatedRobotiqTsfOptions()))
     return RobotiqPackets(), fingertips.answers(bytes.fromhex("9a00580105"), 500)
@@ -80,6 +93,7 @@ DEVICES: dict[str, Callable[[], tuple[Framing, list[bytes]]]] = {
     "icub_eth": _icub,
     "dex3": _dex3,
     "robotiq_tsf": _robotiq,
+    "ros2": _ros2,
     "weiss_dsa": _dsa,
 }
 

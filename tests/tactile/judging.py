@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.rule import BaselineSettings
-from skinware.tactile.testing import BENCH_S, Cover, Gesture, Push, Stroke, World, bench_world, grid
+from skinware.tactile.testing import Cover, Gesture, Push, Stroke, World, grid
+from tests.tactile.bench import BENCH_S, bench_world
 from tests.tactile.peers import CapSense, ICub, Judged, QTouch, Rule, TareOnce
 
 Drift = Literal["slow", "fast"]

@@ -9,8 +9,9 @@ import pytest
 from skinware.status import Status
 from skinware.tactile.baseline import Baseline, Calm
 from skinware.tactile.rule import BaselineSettings
-from skinware.tactile.testing import World, bench_world, grid
+from skinware.tactile.testing import World, grid
 from tests.specification.baseline import SpecifiedBaseline
+from tests.tactile.bench import bench_world
 
 N = 96
 _STEP_NS = 1_000_000_000

@@ -33,13 +33,13 @@ def test_tip_and_modules_are_found(wrong: float) -> None:
     given = with_hand(presses(surface, 1, each=2, pose_noise_m=0.003, wrong=wrong), 1)
     found = place_finger(given, shapes(surface), TIP_M + np.array([0.01, 0.01, -0.01]))
     assert np.linalg.norm(found.tip_m - TIP_M) < 0.001
-    assert found.placement.known.all()
-    assert off_m(surface, found.placement.position_m).mean() < 0.003
-    assert (found.placement.normal * surface.normal).sum(axis=1).mean() > 0.9
+    assert found.known.all()
+    assert off_m(surface, found.position_m).mean() < 0.003
+    assert (found.normal * surface.normal).sum(axis=1).mean() > 0.9
     if wrong:
-        assert 0.05 < found.placement.wrong.mean() < 0.15
+        assert 0.05 < found.wrong.mean() < 0.15
     else:
-        assert found.placement.wrong.mean() < 0.02
+        assert found.wrong.mean() < 0.02
 
 
 def test_modules_without_a_shape_are_left_out() -> None:
@@ -48,8 +48,8 @@ def test_modules_without_a_shape_are_left_out() -> None:
     position[:20] = np.nan
     known = shapes_of(surface.module, [""] * 16, position, surface.normal)
     found = place_finger(with_hand(presses(surface, 2), 2), known, TIP_M)
-    assert found.placement.known.tolist() == [False] * 20 + [True] * 140
-    assert off_m(surface, found.placement.position_m)[20:].mean() < 0.002
+    assert found.known.tolist() == [False] * 20 + [True] * 140
+    assert off_m(surface, found.position_m)[20:].mean() < 0.002
 
 
 def test_what_cannot_be_solved_is_refused() -> None:

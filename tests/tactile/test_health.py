@@ -12,7 +12,8 @@ from skinware.errors import ConfigurationError
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.health import Health, HealthSettings
 from skinware.tactile.health_report import HealthKind, HealthReport
-from skinware.tactile.testing import BENCH_S, Response, World, grid
+from skinware.tactile.testing import Response, World, grid
+from tests.tactile.bench import BENCH_S
 from tests.tactile.judging import Worlds
 from tests.tactile.skins import placed
 from tests.tactile.test_calm_contacts import placed_structure

@@ -9,7 +9,6 @@ import pytest
 
 from skinware import Namespace, ServiceWriter
 from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.tactile.derived_services import WatchedRegions
 from skinware.tactile.motion import COLUMNS
 from skinware.tactile.motion_service import MotionReader, MotionWriter
 from skinware.tactile.regions import Region, Regions
@@ -43,7 +42,7 @@ def into(calm_namespace: Namespace) -> Namespace:
 def test_regions_of_the_driver_are_told(into: Namespace) -> None:
     skin = FakeSkin("fake", placed_structure())
     press(skin)
-    with publishing(skin), calming(into, watched=WatchedRegions(REGIONS)):
+    with publishing(skin), calming(into, regions=REGIONS):
         with MotionReader(namespace=into, timeout_s=10) as motion:
             source = motion.source
             assert source.regions == ("first", "second", "elsewhere")
@@ -68,7 +67,7 @@ def test_another_structure_and_no_regions_in_it(into: Namespace, caplog: pytest.
     skin = FakeSkin("fake", placed_structure())
     press(skin)
     only = Regions([Region("warmth", "temperature", patch=("board 7",))])
-    with publishing(skin), calming(into, watched=WatchedRegions(only)):
+    with publishing(skin), calming(into, regions=only):
         assert "no motion of 'fake': no region is of pressure sensors" in caplog.text
         assert sorted(into.services()) == ["contacts", "fake", "health"]
 
@@ -77,13 +76,13 @@ def test_a_name_that_another_program_has(into: Namespace, caplog: pytest.LogCapt
     skin = FakeSkin("fake", placed_structure())
     press(skin)
     with publishing(skin), MotionWriter(skin.structure, "pressure", REGIONS, (), namespace=into):
-        with calming(into, watched=WatchedRegions(REGIONS)):
+        with calming(into, regions=REGIONS):
             assert "fake-motion" in into.services()
-        with calming(into, watched=WatchedRegions(REGIONS, "mine")):
+        with calming(into, regions=REGIONS, motion="mine"):
             assert "mine" in into.services()
         with (
             MotionWriter(skin.structure, "pressure", REGIONS, (), name="fake-motion", namespace=into),
-            calming(into, watched=WatchedRegions(REGIONS)),
+            calming(into, regions=REGIONS),
         ):
             assert "no motion of 'fake': " in caplog.text
 

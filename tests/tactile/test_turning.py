@@ -13,7 +13,7 @@ from skinware import DriverSnapshot, Status, Structure
 from skinware.errors import ConfigurationError
 from skinware.sensor_types import MAGNETIC_FIELD
 from skinware.tactile.chain import ChainSettings
-from skinware.tactile.loads import Loads
+from skinware.tactile.derived_services import Loads
 from skinware.tactile.stages import Taxels
 from skinware.tactile.vectors import ArrayField, FieldSettings, vectors_of
 from tests.cli.fake_skin import fake_structure

@@ -13,7 +13,8 @@ from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.testing import BENCH_S, Response, Surface, World, bench_world, grid, triangles
+from skinware.tactile.testing import Response, Surface, World, grid, triangles
+from tests.tactile.bench import BENCH_S, bench_world
 
 
 def quiet(surface: Surface | None = None, **settings: object) -> World:

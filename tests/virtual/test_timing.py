@@ -66,9 +66,9 @@ def test_halves_of_a_board_stay_in_order_among_other_boards() -> None:
 def test_the_lowest_identifier_wins_the_wire() -> None:
     wire = Wire()
     third, second, first = wire.attach(), wire.attach(), wire.attach()
-    first.queue.append(Transmission(0, [0x4A0, 0x4A0], [b"12345678", b"abcdefgh"], usual=True))
-    second.queue.append(Transmission(10_000, [0x470, 0x600], [b"x", b"y"]))
-    third.queue.append(Transmission(20_000, [0x8000_0000 | 0x4A0 << 18], [b""]))
+    first.append(Transmission(0, [0x4A0, 0x4A0], [b"12345678", b"abcdefgh"], usual=True))
+    second.append(Transmission(10_000, [0x470, 0x600], [b"x", b"y"]))
+    third.append(Transmission(20_000, [0x8000_0000 | 0x4A0 << 18], [b""]))
     wire.run(1_000_000)
     assert [(frame.identifier & 0x7FF, frame.payload) for frame in wire.heard] == [
         (0x4A0, b"12345678"),  # alone when it began
@@ -82,7 +82,7 @@ def test_the_lowest_identifier_wins_the_wire() -> None:
 def test_a_wire_sends_nothing_before_it_is_due() -> None:
     wire = Wire()
     device = wire.attach()
-    device.queue.append(Transmission(100, [0x470] * 3, [b"12345678"] * 3, usual=True))
+    device.append(Transmission(100, [0x470] * 3, [b"12345678"] * 3, usual=True))
     assert wire.next_start_ns() == 100
     wire.run(100)
     assert wire.heard == []

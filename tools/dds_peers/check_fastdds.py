@@ -50,8 +50,8 @@ class Peer:
     def listen(self, topic: str, message_type: MessageType, *, latched: bool = False) -> None:
         self._say(topic, message_type.dds_name, "latched" if latched else "volatile")
 
-    def send(self, topic: str, message_type: MessageType, message: bytes) -> None:
-        self._say(topic, message_type.dds_name, "send", message.hex())
+    def send(self, topic: str, dds_type: str, message: bytes, times: int = 1) -> None:
+        self._say(topic, dds_type, "send", message.hex(), str(times))
 
     def _say(self, *words: str) -> None:
         assert self.process.stdin is not None
@@ -138,7 +138,7 @@ def check_service(peer: Peer, node: DdsNode) -> tuple[list[str], bool]:
     is_seen = told in peer.data and peer.readers.get(ask) == request.dds_name
     lines = [f"service {SERVICE}: {'seen' if is_seen else 'NOT seen'}, its request is {peer.readers.get(ask)}"]
     identity = bytes(range(16))
-    peer.send(ask, request, ENCAPSULATION + identity + bytes(4))
+    peer.send(ask, request.dds_name, ENCAPSULATION + identity + bytes(4))
     wait_for(lambda: bool(peer.messages[told]))
     answers = [message[: len(ENCAPSULATION) + 16] for message in peer.messages[told]]
     is_answered = answers == [ENCAPSULATION + identity] and len(asked) == 1

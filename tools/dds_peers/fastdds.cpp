@@ -1,5 +1,6 @@
 // A participant with Fast DDS, of this machine alone: fastdds DOMAIN, then lines on stdin:
-// "TOPIC TYPE latched|volatile" listens; "TOPIC TYPE send HEX" writes bytes, with their encapsulation, once a reader is matched.
+// "TOPIC TYPE latched|volatile" listens; "TOPIC TYPE send HEX [TIMES]" writes bytes, with their encapsulation, once a reader is
+// matched: as often as told, every 50 ms.
 //
 // On stdout, for each writer that it finds: "W TOPIC USER_DATA", for each reader: "R TOPIC TYPE", for each message:
 // "M TOPIC SIZE", and SIZE bytes as they came, with their encapsulation. It knows no types. Ends with its stdin.
@@ -110,7 +111,7 @@ struct Discovering : DomainParticipantListener
     }
 };
 
-static bool send(DomainParticipant * participant, const std::string & topic, const std::string & type, const std::string & digits)
+static bool send(DomainParticipant * participant, const std::string & topic, const std::string & type, const std::string & digits, int times)
 {
     DataWriterQos qos;
     qos.reliability().kind = RELIABLE_RELIABILITY_QOS;
@@ -129,7 +130,12 @@ static bool send(DomainParticipant * participant, const std::string & topic, con
     for (size_t at = 0; at + 1 < digits.size(); at += 2) {
         bytes.push_back(static_cast<unsigned char>(std::stoul(digits.substr(at, 2), nullptr, 16)));
     }
-    return matched.current_count > 0 && writer->write(&bytes);
+    bool is_written = matched.current_count > 0 && writer->write(&bytes);
+    for (int time = 1; time < times && is_written; ++time) {
+        std::this_thread::sleep_for(std::chrono::milliseconds(50));
+        is_written = writer->write(&bytes);
+    }
+    return is_written;
 }
 
 int main(int count, char ** arguments)
@@ -161,10 +167,11 @@ int main(int count, char ** arguments)
     for (std::string line; std::getline(std::cin, line); ) {
         std::string topic, type, durability;
         std::string digits;
-        std::istringstream(line) >> topic >> type >> durability >> digits;
+        int times = 1;
+        std::istringstream(line) >> topic >> type >> durability >> digits >> times;
         TypeSupport(new AnyType(type)).register_type(participant);
         if (durability == "send") {
-            if (!send(participant, topic, type, digits)) {std::cerr << "nothing sent to " << topic << std::endl;}
+            if (!send(participant, topic, type, digits, times)) {std::cerr << "nothing sent to " << topic << std::endl;}
             continue;
         }
         DataReaderQos reader;

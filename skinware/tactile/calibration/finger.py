@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,22 +29,7 @@ _PROGRESS = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING, _TINY = 1e-9, 1e6, 1e-12
 
 
-@dataclass(frozen=True)
-class FingerPlacement:
-    """The result of presses with a finger.
-
-    Attributes:
-        tip_m: (3,) tip of the finger, in the frame of its carrier.
-        placement: places of the taxels.
-        rounds: rounds of the search.
-    """
-
-    tip_m: ArrayF
-    placement: Placement
-    rounds: int
-
-
-def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.ArrayLike = (0, 0, 0)) -> FingerPlacement:
+def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.ArrayLike = (0, 0, 0)) -> Placement:
     """Find the places of the tip and the modules.
 
     Args:
@@ -61,8 +45,8 @@ def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.Array
     if len(presses) < _LEAST_PRESSES:
         raise ConfigurationError(f"{len(presses)} presses: a finger needs at least {_LEAST_PRESSES}")
     problem = _Problem.of(presses, shapes, np.asarray(tip_m, np.float64))
-    rounds = problem.solve()
-    return FingerPlacement(problem.tip_m, problem.placement(), rounds)
+    problem.solve()
+    return problem.placement()
 
 
 def _points_m(presses: Presses, tip_m: ArrayF) -> ArrayF:
@@ -120,25 +104,26 @@ class _Problem:
         squares = (self.residuals()[self.counting] ** 2).sum(axis=1)
         return float((np.sqrt(1 + squares / _SOFT_M**2) - 1).sum())
 
-    def solve(self) -> int:
-        """Take steps of Levenberg and Marquardt until nothing improves; return their number."""
+    def solve(self) -> None:
+        """Take steps of Levenberg and Marquardt until nothing improves."""
         damping, cost = 1e-3, self.cost()
-        for number in range(_ROUNDS):
+        for _ in range(_ROUNDS):
             matrix, right = self._normal_equations()
             diagonal = np.diag(np.diag(matrix) + _TINY * np.trace(matrix))
             before, gained = (self.tip_m, dict(self.poses)), 0.0
             while gained <= 0 and damping < _MOST_DAMPING:
-                self.tip_m, self.poses = before[0], dict(before[1])
-                self._move(np.linalg.solve(matrix + damping * diagonal, right))
+                step = np.linalg.solve(matrix + damping * diagonal, right)
+                self.tip_m = before[0] + step[:3]
+                for (number, pose), (turn, shift) in zip(before[1].items(), step[3:].reshape(-1, 2, 3), strict=True):
+                    self.poses[number] = Pose(_rotation(turn) @ pose.rotation, pose.origin_m + shift)
                 gained = cost - self.cost()
                 damping = damping * 4 if gained <= 0 else max(damping / 5, _LEAST_DAMPING)
             if gained <= 0:
                 self.tip_m, self.poses = before
-                return number
+                return
             cost -= gained
             if gained <= _PROGRESS * cost:
-                return number + 1
-        return _ROUNDS
+                return
 
     def _normal_equations(self) -> tuple[ArrayF, ArrayF]:
         """Matrix and right side for a step of the tip and, by module, its turn and shift."""
@@ -155,12 +140,6 @@ class _Problem:
         flat = jacobian.reshape(-1, jacobian.shape[2])
         return flat.T @ flat, -flat.T @ (residual * root).reshape(-1)
 
-    def _move(self, step: npt.NDArray[Any]) -> None:
-        self.tip_m = self.tip_m + step[:3]
-        for number, (turn, shift) in zip(self.poses, step[3:].reshape(-1, 2, 3), strict=True):
-            pose = self.poses[number]
-            self.poses[number] = Pose(_rotation(turn) @ pose.rotation, pose.origin_m + shift)
-
     def placement(self) -> Placement:
         n = self.presses.n
         position, normal, error = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
@@ -173,7 +152,8 @@ class _Problem:
             squares = np.where(np.isfinite(residual), residual, 0) ** 2
             many = max(share.sum() ** 2 / max((share**2).sum(), 1e-12), 1.0)
             error[shape.taxel] = np.sqrt((share * squares).sum() / max(share.sum(), 1e-12) * 2 / many)
-        return Placement(position, normal, error, self.presses.times_pressed, residual, residual >= _WRONG_M)
+        pressed, wrong = self.presses.times_pressed, residual >= _WRONG_M
+        return Placement(position, normal, error, pressed, residual, wrong, tip_m=self.tip_m)
 
 
 def _crossing(arm: ArrayF) -> ArrayF:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -223,7 +222,9 @@ def _errors(problem: _Trial, presses: int) -> tuple[tuple[float, float], float, 
     All of it is of frames that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
     """
     left, expected = (np.zeros_like(problem.force_n) for _ in range(2))
-    for rows in _tenths(len(left)):
+    part = np.arange(len(left)) * _PARTS // len(left)
+    for number in range(_PARTS):
+        rows = part == number
         gain, weights = problem.solve(~rows)
         expected[rows] = np.maximum(problem.forces(weights, gain)[rows], 0)
     left = np.abs(problem.force_n - expected)
@@ -235,8 +236,3 @@ def _errors(problem: _Trial, presses: int) -> tuple[tuple[float, float], float, 
     scale = float(np.quantile(left[::2] / deviation[::2], level)) / 1.96
     held = float((left[1::2] <= 1.96 * scale * deviation[1::2]).mean())
     return (scale * float(slopes[0]), scale * float(slopes[1])), float(np.sqrt((left**2).mean())), held
-
-
-def _tenths(m: int) -> Iterator[npt.NDArray[np.bool_]]:
-    part = np.arange(m) * _PARTS // m
-    return (part == number for number in range(_PARTS))

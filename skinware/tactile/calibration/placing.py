@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.calibration.shapes import Shape, fitted
-from skinware.tactile.calibration.tool import Moves, Smoother, ToolErrors, compare_with_layout, regress
+from skinware.tactile.calibration.tool import ToolErrors, compare_with_layout, regress
 
 ArrayF = npt.NDArray[np.float64]
 ArrayI = npt.NDArray[np.int64]
@@ -43,6 +43,7 @@ class Placement:
         residual_m: (m,) distance of the point of each press from the centre of its taxels.
         wrong: (m,) bool, presses that were left out.
         tool: the errors of the tool that the presses show.
+        tip_m: (3,) tip of the finger that pressed, in the frame of its carrier; NaN: the points were known.
     """
 
     position_m: ArrayF
@@ -52,6 +53,7 @@ class Placement:
     residual_m: ArrayF
     wrong: npt.NDArray[np.bool_]
     tool: ToolErrors = field(default_factory=ToolErrors)
+    tip_m: ArrayF = field(default_factory=lambda: np.full(3, np.nan))
 
     @property
     def known(self) -> npt.NDArray[np.bool_]:
@@ -91,14 +93,22 @@ def place(
     shapes = shapes or {}
     position, _, trust, is_precise = _settled(presses, {})
     error = _errors(presses, trust, {}, is_precise, position)
-    of_tool = regress(Moves(presses.pose, *presses.moves), trust, error, *_smoothers(presses, trust))
-    presses, tool = replace(presses, pose=presses.pose - of_tool.shift_m), of_tool.tool
+    given, weight = presses, trust[presses.press] * presses.load
+
+    def means(of: ArrayF) -> ArrayF:
+        return _means(given, weight, of)
+
+    def left(of: ArrayF) -> ArrayF:
+        return of - _centres(given, means(of))
+
+    tool, shift_m, tool_error_m = regress(given.pose, given.motions, trust, error, means, left)
+    presses = replace(given, pose=given.pose - shift_m)
     position, normal, trust, is_precise = _settled(presses, shapes)
-    error = np.hypot(_errors(presses, trust, shapes, is_precise, position), of_tool.error_m)
+    error = np.hypot(_errors(presses, trust, shapes, is_precise, position), tool_error_m)
     residual = _residuals(presses, position)
     if layout_m is not None:
         modules = [shape.taxel for shape in shapes.values()]
-        tool = compare_with_layout(tool, position, layout_m, modules, of_tool.error_m, is_here=is_here)
+        tool = compare_with_layout(tool, position, layout_m, modules, tool_error_m, is_here=is_here)
     if offset_m:
         if not np.isfinite(normal).all(axis=1).any():
             raise ConfigurationError(
@@ -114,22 +124,11 @@ def _settled(presses: Presses, shapes: Mapping[int, Shape]) -> tuple[ArrayF, Arr
     for _ in range(_ROUNDS):
         residual = _residuals(presses, position)
         trust = _trust(residual)
-        is_precise = _spread(residual, trust) < _PRECISE_M
+        counting = residual[trust > 0]
+        spread_m = float(np.median(counting)) / _TYPICAL if len(counting) else 0.0
+        is_precise = max(spread_m, _LEAST_SPREAD_M) < _PRECISE_M
         position, normal = _places(presses, trust, shapes, is_precise)
     return position, normal, trust, is_precise
-
-
-def _smoothers(presses: Presses, trust: ArrayF) -> tuple[Smoother, Smoother]:
-    """Means of features of presses over the taxels, and what differs from the centre of these means."""
-    weight = trust[presses.press] * presses.load
-
-    def means(of: ArrayF) -> ArrayF:
-        return _means(presses, weight, of)
-
-    def left(of: ArrayF) -> ArrayF:
-        return of - _centres(presses, means(of))
-
-    return means, left
 
 
 def _places(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_precise: bool) -> tuple[ArrayF, ArrayF]:
@@ -193,12 +192,6 @@ def _centres(presses: Presses, of: ArrayF) -> ArrayF:
     total = np.bincount(press, load, len(presses))
     sums = [np.bincount(press, load * column[taxel], len(presses)) for column in of.T]
     return np.where(total > 0, sums, np.nan).T / np.where(total > 0, total, 1)[:, None]
-
-
-def _spread(residual: ArrayF, trust: ArrayF) -> float:
-    """The standard deviation of the residuals that count, along one axis, m."""
-    counting = residual[trust > 0]
-    return max(float(np.median(counting)) / _TYPICAL if len(counting) else 0.0, _LEAST_SPREAD_M)
 
 
 def _trust(residual: ArrayF) -> ArrayF:
@@ -316,18 +309,13 @@ class Presses:
             np.concatenate([self.press, np.full(len(press.taxel), len(self))]),
             np.concatenate([self.taxel, press.taxel]),
             np.concatenate([self.load, press.load]),
-            np.concatenate([self._motion, press.motion[None]]),
+            np.concatenate([self.motions, press.motion[None]]),
         )
 
     @property
-    def _motion(self) -> ArrayF:
+    def motions(self) -> ArrayF:
+        """(m, 7) the time, velocity and way of each press; NaN: not known."""
         return self.motion if len(self.motion) else np.full((len(self), 7), np.nan)
-
-    @property
-    def moves(self) -> tuple[ArrayF, ArrayF, ArrayF]:
-        """(m,) the times, (m, 3) the velocities and (m, 3) the ways of the presses; NaN: not known."""
-        motion = self._motion
-        return motion[:, 0], motion[:, 1:4], motion[:, 4:]
 
     def __len__(self) -> int:
         return len(self.pose)

@@ -66,55 +66,30 @@ class ToolErrors:
         return [*lines, f"would not show: {open_m}"] if open_m else lines
 
 
-@dataclass(frozen=True)
-class Moves:
-    """The presses as a tool sees them; NaN: not known.
-
-    Attributes:
-        point_m: (m, 3) its points.
-        time_s: (m,) rising.
-        velocity_m_s: (m, 3) while it rested, as far as it did.
-        way: (m, 3) of length 1: from where it came.
-    """
-
-    point_m: ArrayF
-    time_s: ArrayF
-    velocity_m_s: ArrayF
-    way: ArrayF
-
-
-@dataclass(frozen=True)
-class Regression:
-    """The errors of the points, and how sure they are.
-
-    Attributes:
-        tool: what was found.
-        shift_m: (m, 3) by which each point is off, as far as it was found.
-        error_m: (n,) standard error of that in the places, m.
-    """
-
-    tool: ToolErrors
-    shift_m: ArrayF
-    error_m: ArrayF
-
-
-def regress(moves: Moves, trust: ArrayF, error_m: ArrayF, means: Smoother, left: Smoother) -> Regression:
+def regress(
+    point_m: ArrayF, motion: ArrayF, trust: ArrayF, error_m: ArrayF, means: Smoother, left: Smoother
+) -> tuple[ToolErrors, ArrayF, ArrayF]:
     """Find drift, lag and play.
 
     Args:
-        moves: of m presses.
+        point_m: (m, 3) the points of m presses.
+        motion: (m, 7) time, velocity and way of each, as of a :class:`.placing.Press`.
         trust: (m,) the weight of each.
         error_m: (n,) error of the places by chance; an error of the tool that is less certain is left alone.
         means: makes (n, k) of (m, k): the means of presses over the taxels that felt them.
         left: makes (m, k) of (m, k): what differs from the centre of those means.
+
+    Returns:
+        The errors, (m, 3) m by which each point is off as far as it was found, and (n,) m the standard error of that in
+        the places.
     """
     counting = trust > 0
     most_m = float(np.nanmedian(error_m)) if np.isfinite(error_m).any() else 0.0
-    nothing = Regression(ToolErrors(), np.zeros_like(moves.point_m), np.zeros(len(error_m)))
+    nothing = ToolErrors(), np.zeros_like(point_m), np.zeros(len(error_m))
     if counting.sum() < _FEWEST:
         return nothing
-    residual = left(moves.point_m)
-    terms = {DRIFT: _pieces(moves.time_s, 1), LAG: moves.velocity_m_s[None], PLAY: moves.way[None]}
+    residual, time_s = left(point_m), motion[:, 0]
+    terms = {DRIFT: _pieces(time_s, 1), LAG: motion[None, :, 1:4], PLAY: motion[None, :, 4:]}
     terms = {kind: of for kind, of in terms.items() if np.isfinite(of[:, counting]).all(axis=(0, 2)).mean() > 0.5}
     terms = {kind: np.nan_to_num(of) for kind, of in terms.items()}
     rest = {kind: np.nan_to_num([left(feature) for feature in of]) for kind, of in terms.items()}
@@ -126,7 +101,7 @@ def regress(moves: Moves, trust: ArrayF, error_m: ArrayF, means: Smoother, left:
     knots = int(counting.sum()) // _PRESSES_A_KNOT
     if DRIFT in terms and knots >= 2:
         for pieces in (min(_KNOTS, knots), min(_KNOTS * _FINER, knots)):
-            finer = _Fit.of({**terms, DRIFT: _pieces(moves.time_s, pieces)}, residual, trust, left)
+            finer = _Fit.of({**terms, DRIFT: _pieces(time_s, pieces)}, residual, trust, left)
             if not finer.is_better_than(fit):
                 break
             fit = finer
@@ -135,7 +110,7 @@ def regress(moves: Moves, trust: ArrayF, error_m: ArrayF, means: Smoother, left:
                 doubts.append(
                     "the tool moves to and fro too quickly to be followed: fasten it, or look at its tracking"
                 )
-    return _concluded(fit, moves, most_m, means, doubts)
+    return _concluded(fit, time_s, most_m, means, doubts)
 
 
 def _pieces(time_s: ArrayF, pieces: int) -> ArrayF:
@@ -187,23 +162,18 @@ class _Fit:
         gained = other.cost * self.counting / other.counting - self.cost
         return more > 0 and gained > spread * (more + _UNEVEN * math.sqrt(2 * more)) * _INFLATION
 
-    def part(self, kind: str) -> tuple[ArrayF, ArrayF, ArrayF]:
-        """The features (p, m, 3), weights (p,) and covariance (p, p) of a term."""
-        first = 0
-        for name, term in self.terms.items():
-            rows = slice(first, first + len(term))
-            if name == kind:
-                return term, self.weights[rows], self.covariance[rows, rows]
-            first = rows.stop
-        raise KeyError(kind)
 
-
-def _concluded(fit: _Fit, moves: Moves, most_m: float, means: Smoother, doubts: list[str]) -> Regression:
-    shift, error2 = np.zeros_like(moves.point_m), 0.0 * means(moves.point_m)[:, 0]
+def _concluded(
+    fit: _Fit, time_s: ArrayF, most_m: float, means: Smoother, doubts: list[str]
+) -> tuple[ToolErrors, ArrayF, ArrayF]:
+    shift: ArrayF = np.zeros((len(time_s), 3))
+    error2 = 0.0 * means(shift)[:, 0]
     found: list[str] = []
     unchecked = dict.fromkeys(KINDS, math.inf)
-    for kind in fit.terms:
-        features, weights, covariance = fit.part(kind)
+    first = 0
+    for kind, features in fit.terms.items():
+        rows = slice(first, first + len(features))
+        weights, covariance, first = fit.weights[rows], fit.covariance[rows, rows], rows.stop
         of_taxel = np.array([means(feature) for feature in features])  # (p, n, 3)
         each2 = np.einsum("pni,pq,qni->n", of_taxel, covariance, of_taxel)
         typical_m = float(np.sqrt(np.nanmedian(each2)))
@@ -217,19 +187,18 @@ def _concluded(fit: _Fit, moves: Moves, most_m: float, means: Smoother, doubts: 
         del unchecked[kind]
         shift, error2 = shift + effect, error2 + each2
         if is_found:
-            found.append(_words(kind, weights, effect, moves, most_of_it_m))
-    tool = ToolErrors(tuple(found), tuple(doubts), unchecked)
-    return Regression(tool, shift, np.sqrt(np.nan_to_num(error2)))
+            found.append(_words(kind, weights, effect, time_s, most_of_it_m))
+    return ToolErrors(tuple(found), tuple(doubts), unchecked), shift, np.sqrt(np.nan_to_num(error2))
 
 
-def _words(kind: str, weights: ArrayF, effect: ArrayF, moves: Moves, most_m: float) -> str:
+def _words(kind: str, weights: ArrayF, effect: ArrayF, time_s: ArrayF, most_m: float) -> str:
     if kind == LAG:
         return f"the points lag {-float(weights[0]):.2f} s behind the skin: take the times of both from one clock"
     if kind == PLAY:
         play_mm = 2 * _MM * abs(float(weights[0]))
         return f"the points differ by {play_mm:.1f} mm with the way from which the tool comes: it has play"
-    minutes = float(np.nanmax(moves.time_s) - np.nanmin(moves.time_s)) / _MINUTE_S
-    end = ", ".join(f"{_MM * number:.1f}" for number in effect[np.nanargmax(moves.time_s)].tolist())
+    minutes = float(np.nanmax(time_s) - np.nanmin(time_s)) / _MINUTE_S
+    end = ", ".join(f"{_MM * number:.1f}" for number in effect[np.nanargmax(time_s)].tolist())
     return (
         f"the tool drifts: {_MM * most_m:.1f} mm in {minutes:.0f} min, at the end ({end}) mm,"
         f" {_MM * most_m / max(minutes, 1e-9):.1f} mm/min: let it warm up, or set its zero again between presses"

@@ -67,11 +67,6 @@ class StrokeSums:
         self.frames += len(loads)
 
     @property
-    def covered(self) -> npt.NDArray[np.bool_]:
-        """(n,) bool: touched in at least 20 frames."""
-        return self.active >= ENOUGH_FRAMES
-
-    @property
     def known(self) -> npt.NDArray[np.bool_]:
         """(n,) bool: touched in enough frames to be compared with others."""
         return self.active >= _LEAST_FRAMES
@@ -139,7 +134,10 @@ def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
     with np.errstate(divide="ignore"):
         far = np.where(similarity > _LEAST_SIMILAR, np.sqrt(-np.log(similarity)), np.inf)
     np.fill_diagonal(far, np.inf)
-    distance = far * _scale(far, pitch_m)
+    nearest = np.sort(far, axis=1)[:, :_NEAREST] if len(far) > _NEAREST else far[:0]
+    nearest = nearest[np.isfinite(nearest)]
+    typical = float(np.median(nearest)) if len(nearest) else 0.0  # of sqrt(-ln S): a pitch away
+    distance = far * (pitch_m / typical if typical > 0 else pitch_m)
     n = len(sums)
     one, other = np.nonzero(np.triu(distance <= _BESIDE * pitch_m))
     near = np.column_stack(np.nonzero(np.triu(similarity > _TOGETHER)))
@@ -156,16 +154,6 @@ def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
         own = np.flatnonzero(piece[rows] == which)
         linked[rows[own]] = part[own] == part[own][np.argmax(size[part[own]])]
     return Topology(np.column_stack([one, other]), distance, piece, linked)
-
-
-def _scale(far: ArrayF, pitch_m: float) -> float:
-    """Metres per unit of sqrt(-ln S): the nearest taxels are a pitch away."""
-    if len(far) <= _NEAREST:
-        return pitch_m
-    nearest = np.sort(far, axis=1)[:, :_NEAREST]
-    nearest = nearest[np.isfinite(nearest)]
-    typical = float(np.median(nearest)) if len(nearest) else 0.0
-    return pitch_m / typical if typical > 0 else pitch_m
 
 
 def shortest_m(distance_m: ArrayF) -> ArrayF:
@@ -196,23 +184,16 @@ def unrolled_m(topology: Topology, taxels: ArrayI) -> ArrayF:
     ways = topology.geodesics_m(taxels)
     if len(taxels) == 1:
         return np.zeros((1, 2))
-    places = _scaled(ways)
+    squares = ways**2
+    rows = squares.mean(axis=0)
+    value, vector = np.linalg.eigh(-0.5 * (squares - rows - rows[:, None] + squares.mean()))
+    places = vector[:, ::-1][:, :2] * np.sqrt(np.maximum(value[::-1][:2], 0))
     measured = np.isfinite(topology.distance_m[np.ix_(taxels, taxels)])
     typical = float(np.median(ways[measured])) if measured.any() else 1.0
     with np.errstate(divide="ignore"):
         weight = np.where(measured, 1.0, _FAR_WEIGHT * (typical / ways) ** 2)
     np.fill_diagonal(weight, 0)
     return _majorised(places, ways, weight)
-
-
-def _scaled(ways: ArrayF) -> ArrayF:
-    squares = ways**2
-    rows = squares.mean(axis=0)
-    value, vector = np.linalg.eigh(-0.5 * (squares - rows - rows[:, None] + squares.mean()))
-    strongest = vector[:, ::-1][:, :2] * np.sqrt(np.maximum(value[::-1][:2], 0))
-    places = np.zeros((len(ways), 2))
-    places[:, : strongest.shape[1]] = strongest
-    return places
 
 
 def _majorised(places: ArrayF, ways: ArrayF, weight: ArrayF) -> ArrayF:

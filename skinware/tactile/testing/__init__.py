@@ -10,7 +10,6 @@ It gives arrays, so that an algorithm can be compared with the load that no real
         sample.values, sample.truth  # (n,) both
 """
 
-from skinware.tactile.testing.bench import BENCH_S, bench_world
 from skinware.tactile.testing.gestures import Cover, Gesture, Play, Push, Stroke, Wander, read_stage
 from skinware.tactile.testing.response import Response
 from skinware.tactile.testing.surface import ARM_FRAME, Surface, arm, arm_path, grid, triangles
@@ -18,7 +17,6 @@ from skinware.tactile.testing.world import Block, Sample, World
 
 __all__ = [
     "ARM_FRAME",
-    "BENCH_S",
     "Block",
     "Cover",
     "Gesture",
@@ -32,7 +30,6 @@ __all__ = [
     "World",
     "arm",
     "arm_path",
-    "bench_world",
     "grid",
     "read_stage",
     "triangles",

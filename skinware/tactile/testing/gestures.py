@@ -97,9 +97,9 @@ class Gesture(ABC):
     def points_m(self, time_s: ArrayF) -> ArrayF:
         """Return (m, 3) its place at m times, m; NaN if it has none."""
 
-    @abstractmethod
-    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
+    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:  # noqa: ARG002
         """Return (m, k) or (1, k) the distances of k taxels from it at m times, m; NaN or inf: out of reach."""
+        return self.least_distances_m(surface)[taxels][np.newaxis]  # it does not move
 
     @abstractmethod
     def least_distances_m(self, surface: Surface) -> ArrayF:
@@ -118,10 +118,6 @@ class Push(Gesture):
 
     def points_m(self, time_s: ArrayF) -> ArrayF:
         return np.broadcast_to(np.array(self.at_m, np.float64), (len(time_s), 3))
-
-    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
-        del time_s  # it does not move
-        return self.least_distances_m(surface)[taxels][np.newaxis]
 
     def least_distances_m(self, surface: Surface) -> ArrayF:
         distance = np.linalg.norm(surface.position_m - np.array(self.at_m), axis=1)
@@ -220,10 +216,6 @@ class Cover(Gesture):
 
     def points_m(self, time_s: ArrayF) -> ArrayF:
         return np.full((len(time_s), 3), np.nan)
-
-    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
-        del time_s  # it does not move
-        return self.least_distances_m(surface)[taxels][np.newaxis]
 
     def least_distances_m(self, surface: Surface) -> ArrayF:
         distance = np.full(len(surface), np.inf)

@@ -152,16 +152,6 @@ class World:
     )
 
     def __post_init__(self) -> None:
-        self._check()
-        self.faults = Faults.none(len(self.surface))
-        random = np.random.default_rng([self.seed, 0])
-        self.gain = np.clip(1 + self.gain_spread * random.standard_normal(len(self.surface)), 0.3, 3)
-        self.follows = np.clip(1 + self.drift_spread * random.standard_normal(len(self.surface)), 0.1, 3)
-        self.wave_phase = random.uniform(0, 2 * np.pi, self.surface.n_patches)
-        self.late_s = random.uniform(0, 1 / self.rate_hz, self.surface.n_patches)
-        self.late_s[random.integers(self.surface.n_patches)] = 0  # the newest of a frame
-
-    def _check(self) -> None:
         if not len(self.surface):
             raise ConfigurationError("a world needs at least one taxel")
         if not self.rate_hz > 0 or not 0 <= self.jitter <= 0.9 or not self.wave_s > 0 or not self.step >= 0:
@@ -175,6 +165,13 @@ class World:
             raise ConfigurationError(f"idle {self.idle} is not between {self.minimum} and {self.maximum}")
         if not info.min <= self.minimum <= self.maximum <= info.max:
             raise ConfigurationError(f"{self.minimum} to {self.maximum}: more than {dtype.name} holds")
+        self.faults = Faults.none(len(self.surface))
+        random = np.random.default_rng([self.seed, 0])
+        self.gain = np.clip(1 + self.gain_spread * random.standard_normal(len(self.surface)), 0.3, 3)
+        self.follows = np.clip(1 + self.drift_spread * random.standard_normal(len(self.surface)), 0.1, 3)
+        self.wave_phase = random.uniform(0, 2 * np.pi, self.surface.n_patches)
+        self.late_s = random.uniform(0, 1 / self.rate_hz, self.surface.n_patches)
+        self.late_s[random.integers(self.surface.n_patches)] = 0  # the newest of a frame
 
     # Gestures
 

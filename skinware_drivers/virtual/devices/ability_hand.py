@@ -8,11 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _ASKED = "asked"  # in the memory of a device: the command to be answered
 _MOVES = "moves"  # commands to move so far
@@ -41,7 +39,7 @@ class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
     swing = 3000
     streams = "never"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(30, 6)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:

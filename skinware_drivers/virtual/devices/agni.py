@@ -11,11 +11,9 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _DEVICE, _TYPE = 7, 0x0203
 _BAD_CHECKSUM, _UNKNOWN, _NO_SUCH_SENSOR = 0xF0, 0xF1, 0xF2
@@ -39,7 +37,7 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
     full_scale = 4095
     swing = 3500
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(sum(self.options.sensors), 4)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
@@ -56,9 +54,6 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         """Return ``sensor1`` and so on; other messages are answers."""
         return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self.options.sensors) else "answer"
-
-    def kinds(self) -> Sequence[str]:
-        return [f"sensor{number}" for number, _ in enumerate(self.options.sensors, 1)]
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
         target, number = command[2:4]

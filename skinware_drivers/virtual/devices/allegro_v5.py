@@ -9,8 +9,6 @@ import struct
 from collections.abc import Collection, Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import (
@@ -18,6 +16,7 @@ from skinware_drivers.virtual import (
     Device,
     Emulator,
     EmulatorOptions,
+    Places,
     SerialEmulator,
     SerialEmulatorOptions,
     on_a_grid,
@@ -41,11 +40,8 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
     identifiers: Collection[int] = frozenset((0x150, 0x154, 0x3C0, 0x3C8, 0x140, 0x148))
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(16, 4)
-
-    def kinds(self) -> Sequence[str]:
-        return [self.kind_of(identifier, b"") for identifier in (0x054 << 2, 0x055 << 2)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         return [(0x054 << 2, bytes(values[:8])), (0x055 << 2, bytes(values[8:]))]
@@ -65,20 +61,13 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
     identifiers: Collection[int] = EmulatedAllegroV5.identifiers
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(4, 4)
-
-    def kinds(self) -> Sequence[str]:
-        return [self.kind_of(identifier, b"") for identifier in (self._first << 2, self._first + 2 << 2)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         pascals = [value + self.options.air_pa for value in values]
-        first, second = self._first << 2, self._first + 2 << 2
-        return [(first, struct.pack("<2i", *pascals[:2])), (second, struct.pack("<2i", *pascals[2:]))]
-
-    @property
-    def _first(self) -> int:
-        return 0x050 if self.options.as_in_manual else 0x0F0
+        first = 0x050 if self.options.as_in_manual else 0x0F0
+        return [(first << 2, struct.pack("<2i", *pascals[:2])), (first + 2 << 2, struct.pack("<2i", *pascals[2:]))]
 
 
 class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -94,7 +83,7 @@ class EmulatedAllegroV5Udp(SerialEmulator[EmulatedAllegroV5UdpOptions]):
     datagrams = True
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(16, 4)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

@@ -9,11 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_a_grid
 
 _TACT = 106
 _TOP_10, _FULL = 1, 2
@@ -33,7 +31,7 @@ class EmulatedBarrett(Emulator[EmulatedBarrettOptions]):
     }
     numbered_by = "nodes"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(24, 3)
 
     def boot(self, device: Device, now_ns: int) -> None:  # noqa: ARG002

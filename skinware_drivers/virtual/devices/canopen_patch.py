@@ -13,12 +13,10 @@ from functools import partial
 from importlib import resources
 from typing import Annotated, Any
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
-from skinware_drivers.virtual.device import Actor, Seconds
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_a_grid
+from skinware_drivers.virtual.device import Seconds
 from skinware_drivers.virtual.events import Event
 
 _HEARTBEAT = "heartbeat"
@@ -56,18 +54,18 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         own = {function + node for function in functions for node in (0, *options.nodes)}
         self.identifiers: Collection[int] = {0x000} | own
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         mapped = [variable for _, entries in _tpdos(_make_node(self.options.eds, 1, None)) for variable, _ in entries]
         count = sum(_is_felt(variable) for variable in mapped)
         return on_a_grid(count, max(1, round(count**0.5)))
 
-    def power_up(self, now_ns: int) -> Sequence[Actor]:
-        actors, options = super().power_up(now_ns), self.options
+    def power_up(self, now_ns: int) -> None:
+        super().power_up(now_ns)
+        options = self.options
         for number in options.faulty:
             for after_s, code in ((0, _TOO_HOT), (options.faulty_for_s, 0)):
                 at_ns = now_ns + round((options.faulty_after_s + after_s) * 1e9)
                 self.schedule(at_ns, partial(self._report, self.devices[number], code))
-        return actors
 
     def boot(self, device: Device, now_ns: int) -> None:
         """Send the boot-up message and be pre-operational, or with ``streaming`` operational."""
@@ -79,7 +77,11 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
         if identifier == 0x000 and len(payload) == 2 and payload[1] in (0, device.number):
-            return self._command(device, payload[0], now_ns)
+            if payload[0] in _RESETS:
+                self.lose_power_for_a_moment(device, now_ns)
+            elif payload[0] in _STATES:
+                self._go_to(device, _STATES[payload[0]], now_ns)
+            return payload[0] in (*_RESETS, *_STATES)
         if identifier == 0x080 and device.memory["state"] == _OPERATIONAL:
             self.burst(device, now_ns)
             return True
@@ -97,11 +99,8 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
 
     def kinds(self) -> Sequence[str]:
         """Name the TPDOs, the answers of SDO and the heartbeats of each node."""
-        found = []
-        for number in self.numbers:
-            node = _make_node(self.options.eds, number, None)
-            found += [*(identifier for identifier, _ in _tpdos(node)), 0x580 + number, 0x700 + number]
-        return [self.kind_of(identifier, b"") for identifier in found]
+        beside = [self.kind_of(first + number, b"") for number in self.numbers for first in (0x580, 0x700)]
+        return [*super().kinds(), *beside]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         found, rest = [], list(values)
@@ -109,7 +108,9 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
             bits, length = 0, 0
             for variable, width in entries:
                 value = rest.pop(0) if _is_felt(variable) else variable.default
-                bits |= _bits(variable, value, width) << length
+                if variable.data_type == _REAL32:
+                    value = int.from_bytes(struct.pack("<f", value), "little")
+                bits |= (value & ((1 << width) - 1)) << length
                 length += width
             found.append((identifier, bits.to_bytes(-(-length // 8), "little")))
         return found
@@ -123,15 +124,6 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         if device.alive and now_ns >= device.ready_ns:
             self.reply(device, (0x080 + device.number, struct.pack("<HB5x", code, int(code != 0))), now_ns)
             self.log.append(Event("error_reported", now_ns, board=device.number, code=code))
-
-    def _command(self, device: Device, command: int, now_ns: int) -> bool:
-        if command in _RESETS:
-            self.lose_power_for_a_moment(device, now_ns)
-        elif command in _STATES:
-            self._go_to(device, _STATES[command], now_ns)
-        else:
-            return False
-        return True
 
     def _go_to(self, device: Device, state: int, now_ns: int) -> None:
         device.memory["state"] = state
@@ -192,9 +184,3 @@ def _tpdos(node: Any) -> list[tuple[int, list[tuple[Any, int]]]]:
 
 def _is_felt(variable: Any) -> bool:
     return not variable.unit
-
-
-def _bits(variable: Any, value: int, width: int) -> int:
-    if variable.data_type == _REAL32:
-        return int.from_bytes(struct.pack("<f", value), "little")
-    return value & ((1 << width) - 1)

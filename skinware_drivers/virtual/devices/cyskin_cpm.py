@@ -9,11 +9,9 @@ import struct
 from collections.abc import Collection, Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_a_grid
 
 _SENT_AS = [13, 15, 12, 14, 10, 11, 8, 9, 6, 4, 7, 0, 3, 5, 2, 1]
 """Position of taxel 0, 1, 2 ... in the sixteen values of a set."""
@@ -30,7 +28,7 @@ class EmulatedCyskinCpm(Emulator[EmulatedCyskinCpmOptions]):
     identifiers: Collection[int] = frozenset((0x405, 0x407, 0x409, 0x40B))
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(16, 4)
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002

@@ -12,10 +12,9 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _PADS = 9
 _PRESSURE, _TEMPERATURE = (100_000,) * 12, (25,) * 12
@@ -38,15 +37,12 @@ class EmulatedDex3(SerialEmulator[EmulatedDex3Options]):
     streams = "always"
     numbered_by = "hands"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         cells = on_a_grid(12 * _PADS, 12).reshape(_PADS, 12, 2)
         return np.concatenate([cells, cells], axis=1).reshape(-1, 2)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         return f"hand{payload[6]}" if len(payload) > 6 else ""
-
-    def kinds(self) -> Sequence[str]:
-        return [f"hand{number}" for number in self.numbers]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         pads = b"".join(struct.pack("<24f2I", *values[24 * pad : 24 * pad + 24], 0, 0) for pad in range(_PADS))

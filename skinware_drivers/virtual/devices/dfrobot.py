@@ -9,11 +9,10 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedDfrobotOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -47,7 +46,7 @@ class EmulatedDfrobot(ModbusEmulator[EmulatedDfrobotOptions]):
         self._is_square = {unit: shape == "6x6" for unit, shape in zip(options.units, shapes, strict=True)}
         super().__init__(options, **more)
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         of_shape = {True: on_a_grid(36, 6), False: on_a_grid(32, 8)}
         return np.concatenate([places for shape, places in of_shape.items() if shape in self._is_square.values()])
 

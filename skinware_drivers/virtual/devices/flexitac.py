@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedFlexiTacOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -43,7 +42,7 @@ class EmulatedFlexiTac(SerialEmulator[EmulatedFlexiTacOptions]):
         self._sound[list(options.broken_rows)] = 0
         self._sound[:, list(options.broken_columns)] = 0
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(self.options.rows * self.options.columns, self.options.columns)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002

@@ -9,11 +9,9 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _ROOM = 24
 
@@ -42,7 +40,7 @@ class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
     streams = "always"
     numbered_by = "boards"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(12 * self.options.triangles, 12)
 
     def kinds(self) -> Sequence[str]:

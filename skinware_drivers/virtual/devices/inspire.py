@@ -9,10 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions
 
 _FINGER = ((3, 3), (12, 8), (10, 8))
 _THUMB = ((3, 3), (12, 8), (3, 3), (12, 8))
@@ -37,7 +36,7 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
     step = 2
     numbered_by = "unit"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         """Return places of fingers side by side, the little one left, each from its tip down; the palm is below."""
         found = []
         for finger in range(5):
@@ -66,7 +65,7 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
         return {3000 + 2 * number: value for number, value in enumerate(sent)}
 
 
-def _spread(rows: int, columns: int, corner: tuple[float, float], size: tuple[float, float]) -> npt.NDArray[np.float64]:
+def _spread(rows: int, columns: int, corner: tuple[float, float], size: tuple[float, float]) -> Places:
     """Return (rows * columns, 2) places in a rectangle, row by row."""
     row, column = np.divmod(np.arange(rows * columns), columns)
     share = np.stack([(column + 0.5) / columns, (row + 0.5) / rows], axis=1)

@@ -9,11 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_a_grid
 
 _SIZES = {"12x6": (12, 6), "10x4": (10, 4)}
 _OF_HAND = {"hand_23x9": ((23, 9), (28, 20)), "hand_12x6": ((12, 6), (14, 16))}
@@ -57,7 +55,7 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
         if options.program_ms:
             self.period_s = options.program_ms / 1e3
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         if self.options.touch in _FIRST:
             return on_a_grid(20, 5)
         cells = sum(rows * columns for rows, columns in map(self._size, self._commands))

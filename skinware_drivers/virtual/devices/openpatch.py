@@ -10,11 +10,9 @@ import zlib
 from collections.abc import Collection, Sequence
 from typing import Annotated, Any
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _TAXELS = 12
 _SHORTEST_US, _LONGEST_US = 1000, 1_000_000
@@ -90,7 +88,7 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         ]
         self._crc = zlib.crc32(b"".join(self._items))
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(_TAXELS * self.options.modules, _TAXELS)
 
     def boot(self, device: Device, now_ns: int) -> None:
@@ -150,7 +148,7 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         return f"module{body[1]}" if body[0] == _DATA else {_BOOT: "boot", _REPORT: "report"}.get(body[0], "answer")
 
     def kinds(self) -> Sequence[str]:
-        return [*(f"module{module}" for module in range(self.options.modules)), "boot", "report"]
+        return [*super().kinds(), "boot", "report"]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         memory = device.memory

@@ -7,14 +7,14 @@ tests/serial/test_paxini.py.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _LONGEST_COMMAND = 64
 _NO_COMMAND = 2
@@ -64,10 +64,12 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
     swing = 60
 
     def __init__(self, options: EmulatedPaxiniOptions, **more: Any) -> None:
-        self.numbers: Sequence[int] = options.sensors if options.board == "converter" else (1,)
+        if options.board == "converter":
+            self.numbers: Sequence[int] = options.sensors
+            self.streams = "never"
         super().__init__(options, **more)
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         options = self.options
         modules = [options.points] if options.board == "converter" else [self.points_of(slot) for slot in options.slots]
         return on_a_grid(sum(modules), 8, each=3)
@@ -81,11 +83,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
     def points_of(self, slot: int) -> int:
         """Return the taxels of the module in a slot; those on the palm send at most nine."""
         return self.options.points if slot < 20 else min(9, self.options.points)
-
-    def boot(self, device: Device, now_ns: int) -> None:
-        """Let a high-speed board stream, if the options say so; sensors only answer."""
-        if self.options.board == "high_speed":
-            super().boot(device, now_ns)
 
     def feel(self, device: Device, time_s: float) -> Sequence[int]:
         felt = list(super().feel(device, time_s))
@@ -101,10 +98,9 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         """Answer commands with a right LRC."""
         if len(command) <= _NO_COMMAND or sum(command) & 0xFF:
             return None
-        of_board: Callable[[Device, bytes, int], bytes | None] = self._answer_of_sensor
         if self.options.board == "high_speed":
-            of_board = self._answer_of_hand
-        return of_board(device, command, now_ns)
+            return self._answer_of_hand(device, command, now_ns)
+        return self._answer_of_sensor(device, command, now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         if self.options.board == "high_speed":
@@ -112,7 +108,11 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        forces = self._tared(device, values)
+        felt = np.array(values).reshape(-1, 3)
+        felt[:, 2] &= 0xFF
+        if device.memory.pop("tare", False):
+            device.memory["zero"] = felt
+        forces = _clipped(felt - device.memory.get("zero", 0))
         if self.options.board == "converter":
             address, count = device.memory["asked"]
             memory = _bytes(_resultant(forces)) + bytes(27) + _bytes(forces)  # from address 1008 on
@@ -162,25 +162,27 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         function, register, count = struct.unpack_from("<BHH", command, 3)
         data = command[8:-1]
         if function == 0x03:
-            read = self._registers(device)[register : register + count]
+            memory = bytearray(0x80)
+            memory[0:15] = b"EMULATED V1.0\0\0"
+            for slot in self.slots():
+                memory[0x10 + slot // 8] |= 1 << slot % 8
+                at = 0x30 + 2 * slot if slot < 20 else 0x66 + 2 * (slot - 20)
+                memory[at : at + 2] = self.options.points.to_bytes(2, "little")
+            memory[0x17] = device.streams_from_ns is not None
+            read = bytes(memory[register : register + count])
             return message(b"\xaa\x55\0", command[3:8], read.ljust(count, b"\0"))
         if function == 0x10 and register == 0x17:
             return self._switch(device, bool(data[0]), now_ns)
         if function == 0x17 and register == 0x02:
-            ready_ns = now_ns + round(1e9 * self.options.calibrates_s)
-            self.schedule(ready_ns, lambda time_ns: self._calibrated(device, time_ns))
+
+            def calibrated(time_ns: int) -> None:
+                if device.alive:
+                    device.memory["tare"] = True
+                    self.say(device, message(b"\xaa\x55\0\x17\x02\0\x01\0\0"), time_ns)
+
+            self.schedule(now_ns + round(1e9 * self.options.calibrates_s), calibrated)
             return b""
         return message(b"\xaa\x55\0", struct.pack("<BHH", 0x81, register, 0))
-
-    def _registers(self, device: Device) -> bytes:
-        memory = bytearray(0x80)
-        memory[0:15] = b"EMULATED V1.0\0\0"
-        for slot in self.slots():
-            memory[0x10 + slot // 8] |= 1 << slot % 8
-            at = 0x30 + 2 * slot if slot < 20 else 0x66 + 2 * (slot - 20)
-            memory[at : at + 2] = self.options.points.to_bytes(2, "little")
-        memory[0x17] = device.streams_from_ns is not None
-        return bytes(memory)
 
     def _switch(self, device: Device, on: bool, now_ns: int) -> bytes:
         if on:
@@ -192,18 +194,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         if on and self.options.acknowledge == "nothing":
             return b""
         return message(b"\xaa\x55\0\x10\x17\0\x01\0\0")
-
-    def _calibrated(self, device: Device, time_ns: int) -> None:
-        if device.alive:
-            device.memory["tare"] = True
-            self.say(device, message(b"\xaa\x55\0\x17\x02\0\x01\0\0"), time_ns)
-
-    def _tared(self, device: Device, values: Sequence[int]) -> Forces:
-        felt = np.array(values).reshape(-1, 3)
-        felt[:, 2] &= 0xFF
-        if device.memory.pop("tare", False):
-            device.memory["zero"] = felt
-        return _clipped(felt - device.memory.get("zero", 0))
 
 
 def _clipped(forces: Forces) -> Forces:

@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid
 from skinware_drivers.virtual.serial_device import text_registers
 
 _EDITIONS = {"touch": 1, "pressure": 2, "array_pressure": 3, "force3d": 4}
@@ -64,7 +63,7 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
             self.full_scale, self.rest, self.swing = (127, 3, 90) if options.edition == "force3d" else (0xFFFF, 30, 900)
         super().__init__(options, **more)
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         if self.options.edition == "touch":
             return np.concatenate([on_a_grid(5, 5, each=3), on_a_grid(5, 5)])
         return on_a_grid(_N_VALUES[self.options.edition], 12)
@@ -73,7 +72,11 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
         options = self.options
         on = options.touch and device.memory.get("on", options.enabled)
         if options.edition == "touch":
-            return self._touch(values) if on else dict.fromkeys(range(4200, 4230), 0xFFFF)
+            words = list(values[:15])
+            for proximity in values[15:]:
+                words += [proximity >> 16, proximity & 0xFFFF]
+            states = [1 if finger in options.abnormal else 2 if finger in options.missing else 0 for finger in range(5)]
+            return dict(enumerate([*words, *states] if on else [0xFFFF] * 30, 4200))
         felt = values if on else [0] * len(values)
         if options.edition == "pressure":
             return (
@@ -115,12 +118,3 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
             device.memory["kind"] = value
             return True
         return address in _OTHER_COMMANDS[self.options.edition]
-
-    def _touch(self, values: Sequence[int]) -> Mapping[int, int]:
-        """Return the registers of the edition touch; the high word of a proximity comes first."""
-        words = list(values[:15])
-        for proximity in values[15:]:
-            words += [proximity >> 16, proximity & 0xFFFF]
-        options = self.options
-        status = [1 if finger in options.abnormal else 2 if finger in options.missing else 0 for finger in range(5)]
-        return dict(enumerate([*words, *status], 4200))

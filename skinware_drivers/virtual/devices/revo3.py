@@ -9,11 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, ModbusEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid
 from skinware_drivers.virtual.serial_device import text_registers
 
 _PRESSURE = {
@@ -65,7 +63,7 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
         self._points = options.points or (tuple(_PRESSURE.values()) if options.mapping == "pressure" else _MATRIX)
         super().__init__(options, **more)
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(42 if self.options.sums else sum(self._points), 16)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
@@ -86,7 +84,8 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
             of_pad = values[at : at + n]
             if options.mapping == "packed":
                 pairs = [*of_pad, 0][: n + n % 2]
-                found.update(enumerate(map(_pair, pairs[::2], pairs[1::2]), _PACKED_AT[number]))
+                words = [first << 8 | second for first, second in zip(pairs[::2], pairs[1::2], strict=True)]
+                found.update(enumerate(words, _PACKED_AT[number]))
             else:
                 first = 5240 + 60 * number if options.mapping == "matrix" else [*_PRESSURE][number]
                 found.update(enumerate(of_pad, first))
@@ -136,10 +135,6 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
         else:
             said.update({4023: int(self._sends_sums(device)), 4024: _VALUES[options.values]})
         return {address: device.memory.get(str(address), value) for address, value in said.items()}
-
-
-def _pair(first: int, second: int) -> int:
-    return first << 8 | second
 
 
 _TEXTS = text_registers(3030, "1.0.0") | text_registers(3040, "1.0") | text_registers(3050, _SERIAL_NUMBER)

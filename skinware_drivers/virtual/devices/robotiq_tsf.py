@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _FIELDS = {
     "static": (0x10, 0, 28),
@@ -41,7 +40,7 @@ class EmulatedRobotiqTsf(SerialEmulator[EmulatedRobotiqTsfOptions]):
     swing = (9000,) * 28 + (800,) + (0,) * 10
     numbered_by = "fingers"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return np.concatenate([on_a_grid(28, 4), np.full((11, 2), 0.5)])
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:

@@ -9,11 +9,9 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -34,7 +32,7 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
     swing = 2_000_000
     numbered_by = "patches"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(self.options.cells, 4)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
@@ -51,9 +49,6 @@ class EmulatedSkintalk(SerialEmulator[EmulatedSkintalkOptions]):
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         """Name cells by the byte for patch and cell: ``0x13``."""
         return f"0x{payload[1]:02x}"
-
-    def kinds(self) -> Sequence[str]:
-        return [f"0x{patch << 4 | cell:02x}" for patch in self.options.patches for cell in range(self.options.cells)]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         return [

@@ -8,11 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
 class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -31,15 +29,12 @@ class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
     swing = -3000
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(self.options.taxels, 8)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         """Name taxels by their first byte: ``0x3c``."""
         return f"0x{payload[0]:02x}"
-
-    def kinds(self) -> Sequence[str]:
-        return [f"0x{0x3C + taxel:02x}" for taxel in range(self.options.taxels)]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
         return [bytes((0x3C + taxel, 1, value >> 8, value & 0xFF, 0)) for taxel, value in enumerate(values)]

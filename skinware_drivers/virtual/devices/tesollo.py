@@ -7,15 +7,27 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _MOTORS_AND_FINGERS = {"1f": (3, 1), "2f": (6, 2), "3f": (12, 3), "4f": (18, 4), "5f": (20, 5), "5f15": (15, 5)}
+
+
+class _Tips(NamedTuple):
+    kind: int  # number on the wire
+    n_values: int
+    form: str
+
+
+_TIPS = {
+    "tactile_m": _Tips(3, 15, ">15B"),
+    "tactile_s": _Tips(5, 18, ">18H"),
+    "six_axes": _Tips(1, 6, ">6h"),
+    "four_axes": _Tips(4, 4, ">3h4xh"),
+}
 _MODEL = {"1f": 0x1F02, "2f": 0x2F03, "3f": 0x3F02, "4f": 0x4F02, "5f": 0x5F22, "5f15": 0x5F44}
 
 
@@ -35,15 +47,19 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
     speed_mbit_s = 100
     streams = "never"
 
-    def places(self) -> npt.NDArray[np.float64]:
-        return on_a_grid(len(self._fitted) * self._each_has, self._each_has)
+    def places(self) -> Places:
+        count = _TIPS[self.options.tips].n_values
+        return on_a_grid(len(self._fitted) * count, count)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         return cut_packets(heard, b"\0", lambda part: max(3, part[1]) if len(part) > 1 else 0)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
         if command[2] == 8:
-            return self._version()
+            about = struct.pack(">BHBB", 8, _MODEL[self.options.hand], 1, 5)
+            if not self.options.old:
+                about += bytes([_TIPS[self.options.tips].kind, self.options.fitted])
+            return struct.pack(">H", 2 + len(about)) + about
         if command[2] == 1 and 5 in command[3:]:
             device.memory["asked"] = command[3:]
             self.burst(device, now_ns)
@@ -61,30 +77,15 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
         body = b""
         if 1 in device.memory["asked"]:
             body += b"".join(struct.pack(">BhhhB", motor + 1, 10 * motor, -motor, 305, 0) for motor in range(motors))
-        sent = iter(values)
+        sent, tips = iter(values), _TIPS[self.options.tips]
         for finger in range(_MOTORS_AND_FINGERS[self.options.hand][1]):
             if finger in self._fitted:
-                body += struct.pack(self._form, *[next(sent) for _ in range(self._each_has)])
+                body += struct.pack(tips.form, *[next(sent) for _ in range(tips.n_values)])
             elif self.options.pads:
-                body += bytes(struct.calcsize(self._form))
+                body += bytes(struct.calcsize(tips.form))
         return [struct.pack(">HB", len(body) + 3, 1) + body]
 
     @property
     def _fitted(self) -> list[int]:
         _, fingers = _MOTORS_AND_FINGERS[self.options.hand]
         return [finger for finger in range(fingers) if self.options.fitted & 1 << finger]
-
-    @property
-    def _each_has(self) -> int:
-        return {"tactile_m": 15, "tactile_s": 18, "six_axes": 6, "four_axes": 4}[self.options.tips]
-
-    @property
-    def _form(self) -> str:
-        return {"tactile_m": ">15B", "tactile_s": ">18H", "six_axes": ">6h", "four_axes": ">3h4xh"}[self.options.tips]
-
-    def _version(self) -> bytes:
-        model = _MODEL[self.options.hand]
-        kind = {"tactile_m": 3, "tactile_s": 5, "six_axes": 1, "four_axes": 4}[self.options.tips]
-        if self.options.old:
-            return struct.pack(">HBHBB", 7, 8, model, 1, 5)
-        return struct.pack(">HBHBBBB", 9, 8, model, 1, 5, kind, self.options.fitted)

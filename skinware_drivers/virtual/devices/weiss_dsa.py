@@ -9,11 +9,9 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 from skinware_drivers.virtual.devices.weiss_wts import BEGIN, crc, cut_commands
 
 _OK, _WRONG = 0, 1
@@ -34,7 +32,7 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
     full_scale = 4095
     swing = 3500
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(sum(6 * rows for rows in self._rows), 6)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:

@@ -9,11 +9,9 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 BEGIN = b"\xaa\xaa\xaa"
 _NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
@@ -62,7 +60,7 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
     full_scale = 4095
     swing = 3500
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(self.options.columns * self.options.rows, self.options.columns)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
@@ -79,13 +77,11 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
         """Return one message with all cells, without run lengths."""
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000
         header = struct.pack("<IB", uptime_ms & 0xFFFF_FFFF, 0)
-        return [message(0x00, header + struct.pack(f"<{len(values)}H", *self._tared(device, values)))]
-
-    def _tared(self, device: Device, values: Sequence[int]) -> Sequence[int]:
         if device.memory.pop("tare", False):
             device.memory["zero"] = list(values)
-        zero = device.memory.get("zero")
-        return values if zero is None else [max(0, value - z) for value, z in zip(values, zero, strict=True)]
+        zero = device.memory.get("zero", [0] * len(values))
+        cells = [max(0, value - at_rest) for value, at_rest in zip(values, zero, strict=True)]
+        return [message(0x00, header + struct.pack(f"<{len(cells)}H", *cells))]
 
     def _do(self, device: Device, command: bytes, now_ns: int) -> tuple[int, bytes]:
         number, arguments = command[3], command[6:-2]

@@ -11,11 +11,9 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _OK, _BAD_LENGTH, _BAD_CHECKSUM, _UNKNOWN, _BAD_PAYLOAD = 0x00, 0x10, 0x11, 0x12, 0x13
 _NEEDED = {0x0101: 0, 0x0103: 0, 0x0301: 0, 0x0401: 1, 0x0501: 2, 0x0502: 5}  # bytes of arguments
@@ -44,7 +42,7 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
     swing = 3500
     speed_mbit_s = 12  # USB, full speed
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(768, 32)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
@@ -86,15 +84,12 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
             uptime_ms = (now_ns - device.ready_ns) // 1_000_000
             return _OK, struct.pack("<IIIIH", uptime_ms, device.memory.get("sent", -1) + 1, 0, 0, 0)
         if number == 0x0401:
-            return self._stream(device, bool(arguments[0]), now_ns)
+            if arguments[0]:
+                self.start(device, now_ns, 1 / self._hz(device))
+            else:
+                self.stop(device)
+            return _OK, b""
         return self._rate(device, arguments, now_ns)
-
-    def _stream(self, device: Device, on: bool, now_ns: int) -> tuple[int, bytes]:
-        if on:
-            self.start(device, now_ns, 1 / self._hz(device))
-        else:
-            self.stop(device)
-        return _OK, b""
 
     def _hz(self, device: Device) -> int:
         hz: int = device.memory.get("hz", round(1e3 / self.options.period_ms))

@@ -8,7 +8,6 @@ from collections.abc import Collection, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware_drivers.virtual import (
@@ -16,6 +15,7 @@ from skinware_drivers.virtual import (
     Device,
     Emulator,
     EmulatorOptions,
+    Places,
     SerialEmulator,
     SerialEmulatorOptions,
     on_a_grid,
@@ -47,7 +47,7 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
         taxels = {taxel for board in options.boards for taxel in self._taxels(board)}
         self.identifiers: Collection[int] = taxels.union(range(0x200, 0x210))  # commands
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(16, 4, each=3) if self.options.model == "4x4" else on_a_grid(24, 6, each=3)
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
@@ -58,9 +58,6 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
         else:
             self.start(device, now_ns)
         return True
-
-    def kinds(self) -> Sequence[str]:
-        return [self.kind_of(taxel, b"") for board in self.numbers for taxel in self._taxels(board)]
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
         xyz = zip(values[0::3], values[1::3], values[2::3], strict=True)
@@ -96,7 +93,7 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
     speed_mbit_s = 100
     numbered_by = "sensors"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         count, columns = _TAXELS[self.options.model]
         return np.repeat(on_a_grid(count, columns), 3, axis=0)
 
@@ -109,9 +106,6 @@ class EmulatedXelaServer(SerialEmulator[EmulatedXelaServerOptions]):
         """Return ``sensor1`` and so on, or ``welcome``."""
         sent = json.loads(payload)
         return next((f"sensor{number}" for number in self.numbers if str(number) in sent), "welcome")
-
-    def kinds(self) -> Sequence[str]:
-        return [f"sensor{number}" for number in self.numbers]
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         time_s = device.sampled_ns / 1e9

@@ -10,11 +10,9 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 _BOOT_TIME_S = 1_700_000_000.0
 _TAGS = {3: 256 + 10, 4: 256 + 20}
@@ -36,7 +34,7 @@ class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
     speed_mbit_s = 100
     streams = "always"
 
-    def places(self) -> npt.NDArray[np.float64]:
+    def places(self) -> Places:
         return on_a_grid(self.options.length, 12)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:

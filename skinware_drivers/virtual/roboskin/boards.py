@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Mapping
 from typing import ClassVar, Literal
 
@@ -17,7 +18,7 @@ from skinware_drivers.virtual.roboskin.inertial import InertialSensors, Units
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.touch import PressedSkin, Touch, WireSource
 from skinware_drivers.virtual.stage import Stage
-from skinware_drivers.virtual.wire import Transmission, Transmitter
+from skinware_drivers.virtual.wire import Transmission
 
 POLLING, OLD_DATA, DATA, INERTIAL, BOOTLOADER = 2, 3, 4, 5, 7
 """Message classes (icub-firmware-shared:can/canProtocolLib/iCubCanProto_classes.h)."""
@@ -53,21 +54,21 @@ class EmulatedBoard(Device):
     protocol: ClassVar[tuple[int, int]]
     units: ClassVar[Units]
     command_bytes: ClassVar[Mapping[int, int]]
-    stage: Stage[EmulatedRoboskinOptions]
 
     def __init__(
         self,
         address: int,
         stage: Stage[EmulatedRoboskinOptions],
-        transmitter: Transmitter,
+        queue: deque[Transmission],
         now_ns: int,
         *,
         phase: float,
         skin: PressedSkin,
         source: WireSource | None,
     ) -> None:
-        super().__init__(address, stage, transmitter, now_ns)
         options = stage.options
+        super().__init__(address, queue, now_ns, options.seed)
+        self.stage = stage
         self.touch = Touch(options.seed, options.boards.index(address), skin)
         self._source = source
         self.faults = TriangleFaults(options, address)
@@ -196,7 +197,7 @@ class EmulatedBoard(Device):
         if first > last or last >= TRIANGLES:
             return False
         self._active[first : last + 1] = bool(enable & 1)
-        self._converters.set_triangles(first, last, shift, payload[5] | payload[6] << 8)
+        self._converters.set_triangles(first, last, shift=shift, cdc_offset=payload[5] | payload[6] << 8)
         return True
 
     def _set_address(self, address: int) -> bool:
@@ -245,7 +246,7 @@ class EmulatedBoard(Device):
 
     def _send(self, ready_ns: int, message_class: int, low: int, payload: bytes) -> None:
         identifier = message_class << 8 | self.number << 4 | low
-        self.transmitter.queue.append(Transmission(ready_ns, [identifier], [payload]))
+        self.queue.append(Transmission(ready_ns, [identifier], [payload]))
 
     def _log_triangle(self, time_ns: int, triangle: int, fault: TriangleState) -> None:
         event = Event("triangle_fault", time_ns, board=self.number, triangle=triangle, cycle=self.cycle, fault=fault)

@@ -82,23 +82,6 @@ class TriangleFaults:
         mask[triangle] = fault in ("unplugged", "no_ack")
         self.version += 1
 
-    def distort(self, raw: ArrayI) -> None:
-        """Overwrite the readings of unplugged and silent triangles in ``raw``, (n, 16, 12)."""
-        raw[:, self.not_acknowledging] = NO_ACK
-        raw[:, self.disconnected] = NOT_CONNECTED
-
-    def break_taxels(self, raw: ArrayI, baseline: ArrayI, bottom: ArrayI) -> None:
-        """Put broken taxels in ``raw`` far out of range.
-
-        Args:
-            raw: (n, 16, 12) capacitances, changed in place.
-            baseline: (16, 12) of the last calibration.
-            bottom: (16, 1) difference at which a value reaches 0.
-        """
-        if self.broken.any():
-            far = np.minimum(baseline + 2 * bottom + _BEYOND_COUNTS, 0xFFFE)
-            raw[:, self.broken] = far[self.broken]
-
 
 class Acquisition(NamedTuple):
     time_ns: int
@@ -136,17 +119,13 @@ class Converters:
         self._skin_type, self._no_load = skin_type, no_load
         self._settings_changed()
 
-    def set_triangles(self, first: int, last: int, shift: int, cdc_offset: int) -> None:
-        self._shift[first : last + 1] = [min(shift, _LARGEST_SHIFT)] * (last + 1 - first)
-        self._cdc_offset[first : last + 1] = cdc_offset
-        self._settings_changed()
-
-    def set_shift(self, shift: int) -> None:
-        self._shift = [shift] * TRIANGLES
-        self._settings_changed()
-
-    def set_cdc_offset(self, cdc_offset: int) -> None:
-        self._cdc_offset[:] = cdc_offset
+    def set_triangles(
+        self, first: int = 0, last: int = TRIANGLES - 1, *, shift: int | None = None, cdc_offset: int | None = None
+    ) -> None:
+        if shift is not None:
+            self._shift[first : last + 1] = [min(shift, _LARGEST_SHIFT)] * (last + 1 - first)
+        if cdc_offset is not None:
+            self._cdc_offset[first : last + 1] = cdc_offset
         self._settings_changed()
 
     def calibrate(self, time_ns: int, cycle: int) -> None:
@@ -177,7 +156,10 @@ class Converters:
 
     def _acquisitions(self, times_ns: ArrayI, cycles: ArrayI, values: Mapping[int, Sequence[int]]) -> list[Acquisition]:
         raw = self._read(times_ns, cycles)
-        self._faults.break_taxels(raw, self._baseline, self._arithmetic.bottom)
+        broken = self._faults.broken
+        if broken.any():
+            far = np.minimum(self._baseline + 2 * self._arithmetic.bottom + _BEYOND_COUNTS, 0xFFFE)
+            raw[:, broken] = far[broken]
         sample: FirmwareSample = self._arithmetic.sample(raw, self._baseline)
         for triangle, twelve in values.items():
             sample.values[:, triangle] = twelve
@@ -187,7 +169,8 @@ class Converters:
     def _read(self, times_ns: ArrayI, cycles: ArrayI) -> ArrayI:
         """Return (n, 16, 12), the content of the registers."""
         raw = self._touch.capacitances(times_ns, cycles, self._cdc_offset, fingertip=self._skin_type == FINGERTIP)
-        self._faults.distort(raw)
+        raw[:, self._faults.not_acknowledging] = NO_ACK
+        raw[:, self._faults.disconnected] = NOT_CONNECTED
         return raw
 
     def _settings_changed(self) -> None:

@@ -91,13 +91,13 @@ class Mtb3(EmulatedBoard):
             ticks = payload[6] | payload[7] << 8
             own = payload[3] & 0xF == _OWN_TIMER
             self._period_ns = ticks * _TIMER_TICK_NS if own else 50_000_000
-            self._converters.set_cdc_offset(payload[4] | payload[5] << 8)
+            self._converters.set_triangles(cdc_offset=payload[4] | payload[5] << 8)
             self._enabled = True
             self._calibrate_slowly(now_ns + self._period_ns, "command")
         else:
             compensated = payload[4] & 0x08
             self._converters.set_board(payload[4] & 0x03 if compensated else _NOT_COMPENSATED, payload[3])
-            self._converters.set_shift(payload[1] & 0x0F)
+            self._converters.set_triangles(shift=payload[1] & 0x0F)
             enabled = payload[5] | payload[6] << 8
             self._active[:] = [bool(enabled >> triangle & 1) for triangle in range(len(self._active))]
         self._begin_if_enabled(now_ns)
@@ -172,7 +172,7 @@ class Mtb4(EmulatedBoard):
             self._active[:] = True
             self._period_ns = 40_000_000
             self._converters.set_board(DEFAULT_SKIN_TYPE, DEFAULT_NO_LOAD)
-            self._converters.set_cdc_offset(DEFAULT_CDC_OFFSET)
+            self._converters.set_triangles(cdc_offset=DEFAULT_CDC_OFFSET)
             self._calibrate(now_ns, "command")
             self._begin_bursts(now_ns)
         return True

@@ -15,7 +15,7 @@ import numpy as np
 from skinware.geometry import Geometry
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.virtual.device import DATA as BURSTS
-from skinware_drivers.virtual.device import Actor, Device
+from skinware_drivers.virtual.device import Device
 from skinware_drivers.virtual.events import Event, FrameDamage, Half
 from skinware_drivers.virtual.hardware import EventLog, Point, Pressing
 from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, EmulatedBoard
@@ -60,19 +60,13 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
         self._phases = np.random.default_rng([options.seed, n_boards]).uniform(0.02, 1, n_boards).tolist()
 
     def geometry(self) -> Geometry:
-        """Return the places of the sensors: the boards cover a forearm and a hand."""
         return self.skin.geometry()
 
     def pressing(self, now_ns: int) -> list[tuple[Point, float]]:
-        """Return place (m) and force (N) of each press."""
         return self.skin.pressing(self.run_to(now_ns))
 
     def press(self, press: Pressing, now_ns: int) -> dict[str, object]:
-        """Press from now on, besides the wandering fingers of the option ``pattern``.
-
-        Raises:
-            ValueError: no taxel would feel it, or too many presses have not ended yet.
-        """
+        """Press from now on, besides the wandering fingers of the option ``pattern``; see :class:`.PressedSkin`."""
         return self.skin.press(press, self.run_to(now_ns))
 
     def kind_of(self, identifier: int, payload: bytes) -> str:
@@ -110,17 +104,16 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
         phase = self._phases[self.options.boards.index(number)]
         return kind(number, self, self.wire.attach(), now_ns, phase=phase, skin=self.skin, source=self._source)
 
-    def power_up(self, now_ns: int) -> Sequence[Actor]:
+    def power_up(self, now_ns: int) -> None:
         options = self.options
         self.skin.origin_ns = now_ns
-        actors = super().power_up(now_ns)
+        super().power_up(now_ns)
         for address, triangle, taxel in options.places("out_of_range", 3):
             self.log.append(Event("taxel_out_of_range", now_ns, board=address, triangle=triangle, taxel=taxel))
         if options.streaming:
             for device in self.devices.values():
                 for command in _CONFIGURED:
                     self.obey(device, 0x200 | device.number, command, now_ns)
-        return actors
 
     def dying(self) -> Sequence[int]:
         return self.options.dead if self.options.dead_after_cycles is None else ()

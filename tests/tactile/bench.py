@@ -7,9 +7,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.testing.response import Response
-from skinware.tactile.testing.surface import grid
-from skinware.tactile.testing.world import World
+from skinware.tactile.testing import Response, World, grid
 
 BENCH_S = 1500.0
 """How long it lasts, s."""

@@ -1,0 +1,156 @@
+"""Read bags of ROS 1 and ROS 2 with the package rosbags: each topic is a table."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.conversion.foreign.source import BLOCK_BYTES, Rows
+from skinware.conversion.tables import package
+from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
+
+LOG_TIME = "log_time"
+"""The column with the time at which a message was recorded."""
+_FIELDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Types of numbers in points."""
+_PIXELS = {"8": "u1", "16": "u2", "32": "f4", "mono8": "u1", "mono16": "u2"}
+_MOST_ROWS = 1000
+
+
+class BagSource:
+    """A bag: a ``.bag`` of ROS 1, a folder or an ``.mcap`` or ``.db3`` of ROS 2.
+
+    Numbers in messages within messages are columns, as ``header.stamp``; lists of messages are arrays; a point cloud
+    has a column for each of its fields, an image the column ``image``.
+
+    Raises:
+        ConfigurationError: it is no bag, or damaged.
+        MissingExtra: rosbags is not installed.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.share = path, 0.0
+        self._bags = package("rosbags.highlevel", "A bag of ROS")
+        stores = package("rosbags.typesys", "A bag of ROS")
+        self._files = ExitStack()
+        with self._blamed("open it with its own tools, or record it again"):
+            usual = stores.get_typestore(stores.Stores.LATEST)
+            self._bag = self._files.enter_context(self._bags.AnyReader([path], default_typestore=usual))
+        try:
+            firsts = {topic: next(self._messages(topic), None) for topic in self._bag.topics}
+        except BaseException:
+            self.close()
+            raise
+        heard = {topic: first[1] for topic, first in firsts.items() if first is not None}
+        self.left_out: Mapping[str, str] = {topic: "no message" for topic in firsts if topic not in heard}
+        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+            topic: {LOG_TIME: (), **{name: np.shape(each) for name, each in _columns(message).items()}}
+            for topic, message in heard.items()
+        }
+        frames = {topic: getattr(getattr(message, "header", None), "frame_id", "") for topic, message in heard.items()}
+        self.frames: Mapping[str, str] = frames
+
+    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
+        shapes, waiting, size = self.tables[table], dict[str, list[Any]]({name: [] for name in names}), 0
+        for number, (time_ns, message) in enumerate(self._messages(table)):
+            found = {LOG_TIME: time_ns, **_columns(message)}
+            for name, parts in waiting.items():
+                row = np.asarray(found.get(name, ()))
+                if row.shape != shapes[name]:
+                    what = (
+                        f"{name} has the shape {row.shape}, and had {shapes[name]} at first: a skin has a fixed shape"
+                    )
+                    raise ConfigurationError(f"{self.path}, {table}, message {number + 1}: {what}")
+                parts.append(row)
+                size += row.nbytes
+            if size > BLOCK_BYTES or number % _MOST_ROWS == _MOST_ROWS - 1:
+                yield {name: np.stack(parts) for name, parts in waiting.items()}
+                waiting, size = {name: [] for name in names}, 0
+        if any(waiting.values()):
+            yield {name: np.stack(parts) for name, parts in waiting.items()}
+
+    def close(self) -> None:
+        self._files.close()
+
+    def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        bag = self._bag
+        begin_ns, length_ns = bag.start_time, max(1, bag.duration)
+        with self._blamed(f"recover the bag, or leave {topic} out of the map"):
+            for connection, time_ns, data in bag.messages(bag.topics[topic].connections):
+                self.share = (time_ns - begin_ns) / length_ns
+                yield time_ns, bag.deserialize(data, connection.msgtype)
+
+    @contextlib.contextmanager
+    def _blamed(self, what_to_do: str) -> Iterator[None]:
+        try:
+            yield
+        except (ConfigurationError, OSError, GeneratorExit, KeyboardInterrupt):
+            raise
+        except Exception as error:  # noqa: BLE001, rosbags raises whatever its parsers meet
+            where = f" at {self.share:.0%}" if self.share else ""
+            what = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ConfigurationError(f"{self.path}: no bag of ROS, or damaged{where} ({what}): {what_to_do}") from None
+
+
+def _columns(message: Any) -> dict[str, Any]:
+    """Return the numbers of a message by name."""
+    kind = getattr(message, "__msgtype__", "")
+    if kind == "sensor_msgs/msg/PointCloud2":
+        return {**_stamp(message), **_points(message)}
+    if kind == "sensor_msgs/msg/Image":
+        return {**_stamp(message), **_image(message)}
+    found: dict[str, Any] = {}
+    for each in fields(message):
+        found |= _column(each.name, getattr(message, each.name))
+    return found
+
+
+def _stamp(message: Any) -> dict[str, Any]:
+    return _column("header", message.header)
+
+
+def _column(name: str, value: Any) -> dict[str, Any]:
+    if hasattr(value, "sec") and hasattr(value, "nanosec"):
+        return {name: value.sec * NS_PER_S + value.nanosec}
+    if is_dataclass(value):
+        return {f"{name}.{inner}": each for inner, each in _columns(value).items()}
+    if isinstance(value, list) and value and all(map(is_dataclass, value)):
+        rows = [_columns(each) for each in value]
+        same = [inner for inner in rows[0] if len({np.shape(row.get(inner, ())) for row in rows}) == 1]
+        return {f"{name}.{inner}": np.stack([row[inner] for row in rows]) for inner in same}
+    numbers = np.asarray(value) if not isinstance(value, str | list) else np.zeros(0)
+    return {name: numbers} if numbers.dtype.kind in "iufb" and (numbers.size or numbers.ndim > 1) else {}
+
+
+def _points(message: Any) -> Mapping[str, npt.NDArray[Any]]:
+    order = ">" if message.is_bigendian else "<"
+    dtype = np.dtype(
+        {
+            "names": [each.name for each in message.fields],
+            "formats": [(order + _FIELDS[each.datatype], (each.count,)) for each in message.fields],
+            "offsets": [each.offset for each in message.fields],
+            "itemsize": message.point_step,
+        }
+    )
+    rows = np.frombuffer(message.data, np.uint8)[: message.height * message.row_step].reshape(message.height, -1)
+    points = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(dtype).ravel()
+    return {name: points[name][:, 0] if points[name].shape[1] == 1 else points[name] for name in dtype.names or ()}
+
+
+def _image(message: Any) -> Mapping[str, npt.NDArray[Any]]:
+    encoding = str(message.encoding)
+    code = _PIXELS.get(encoding) or _PIXELS.get("".join(filter(str.isdigit, encoding.partition("C")[0])), "u1")
+    dtype = np.dtype((">" if message.is_bigendian else "<") + code)
+    rows = np.frombuffer(message.data, np.uint8)[: message.height * message.step].reshape(message.height, -1)
+    pixels = np.ascontiguousarray(rows[:, : message.step // dtype.itemsize * dtype.itemsize]).view(dtype)
+    channels = max(1, pixels.shape[1] // max(1, message.width))
+    return {"image": np.squeeze(pixels[:, : message.width * channels].reshape(message.height, message.width, channels))}

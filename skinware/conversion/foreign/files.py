@@ -1,0 +1,218 @@
+"""Read arrays of numpy, tables of Parquet, and LeRobot's datasets."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import zipfile
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack
+from itertools import islice, product
+from math import prod
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.conversion.foreign.source import BLOCK_BYTES, Rows
+from skinware.conversion.tables import package, pyarrow
+from skinware.errors import ConfigurationError
+
+_BATCH_ROWS = 4096
+_EPISODE_GAP_S = 1.0
+"""Time between the last row of an episode and the first of the next."""
+TIME = "time_s"
+"""The column that a dataset has besides its own: the episodes one after the other."""
+
+
+class _Array(NamedTuple):
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    in_columns: bool
+
+
+class NpzSource:
+    """An NPZ file. Arrays of equally many rows are a table: ``""``, or ``N rows`` where a file has several.
+
+    Raises:
+        ConfigurationError: it is no such file, or damaged.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.share = path, 0.0
+        self.frames: Mapping[str, str] = {}
+        try:
+            self._zip = zipfile.ZipFile(path)
+            found = {name.removesuffix(".npy"): self._head(name) for name in self._zip.namelist()}
+        except (zipfile.BadZipFile, ValueError, EOFError, SyntaxError) as error:
+            raise ConfigurationError(f"{path}: not an NPZ file, or damaged ({error})") from None
+        self._arrays = {
+            name: each for name, each in found.items() if each.dtype.kind in "iufbM" and each.shape and all(each.shape)
+        }
+        self.left_out: Mapping[str, str] = {
+            name: f"{each.dtype} of shape {each.shape}" for name, each in found.items() if name not in self._arrays
+        }
+        lengths = dict.fromkeys(each.shape[0] for each in self._arrays.values())
+        self._table_of = {length: f"{length} rows" if len(lengths) > 1 else "" for length in lengths}
+        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+            table: {name: each.shape[1:] for name, each in self._arrays.items() if each.shape[0] == length}
+            for length, table in self._table_of.items()
+        }
+
+    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:  # noqa: ARG002, the names are enough
+        arrays = {name: self._arrays[name] for name in names}
+        length = next((each.shape[0] for each in arrays.values()), 0)
+        count = max(
+            1, BLOCK_BYTES // max(1, sum(prod(each.shape[1:]) * each.dtype.itemsize for each in arrays.values()))
+        )
+        with ExitStack() as stack:
+            streams = {name: self._open(name, stack) for name in arrays}
+            for first in range(0, length, count):
+                until = min(first + count, length)
+                self.share = until / length
+                yield {name: self._read(name, streams[name], first, until) for name in arrays}
+
+    def close(self) -> None:
+        self._zip.close()
+
+    def _head(self, name: str) -> _Array:
+        with self._zip.open(name) as stream:
+            return _header(stream)
+
+    def _open(self, name: str, stack: ExitStack) -> IO[bytes] | npt.NDArray[Any]:
+        stream = stack.enter_context(self._zip.open(name + ".npy"))
+        if self._arrays[name].in_columns:  # rows are all over the file
+            whole: npt.NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+            return whole
+        _header(stream)
+        return stream
+
+    def _read(self, name: str, stream: IO[bytes] | npt.NDArray[Any], first: int, until: int) -> npt.NDArray[Any]:
+        if isinstance(stream, np.ndarray):
+            return stream[first:until]
+        shape, dtype, _ = self._arrays[name]
+        size = (until - first) * prod(shape[1:]) * dtype.itemsize
+        try:
+            data = stream.read(size)
+        except (zipfile.BadZipFile, ValueError, EOFError) as error:
+            raise ConfigurationError(f"{self.path}: {name} is damaged after row {first} ({error})") from None
+        if len(data) != size:
+            raise ConfigurationError(f"{self.path}: {name} ends too early, after row {first}: save it again")
+        return _plain(np.frombuffer(data, dtype).reshape(-1, *shape[1:]))
+
+
+def _header(stream: IO[bytes]) -> _Array:
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, in_columns, dtype = read(stream)
+    return _Array(shape, dtype, in_columns and len(shape) > 1)
+
+
+def _plain(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return times as int64, ns since 1970; other numbers as they are."""
+    return rows.astype("datetime64[ns]").astype(np.int64) if rows.dtype.kind == "M" else rows
+
+
+class ParquetSource:
+    """A Parquet file, or all files of a folder in the order of their names.
+
+    Raises:
+        ConfigurationError: it is no such file, or damaged.
+        MissingExtra: pyarrow is not installed.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.share = path, 0.0
+        self.frames: Mapping[str, str] = {}
+        self._arrow = pyarrow()
+        self._paths = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
+        self._rows = 0
+        for each in self._paths:
+            with self._opened(each) as file:
+                self._rows += file.metadata.num_rows
+        with self._opened(self._paths[0]) as file:
+            kinds = {field.name: str(field.type) for field in file.schema_arrow}
+            batches = list(islice(file.iter_batches(_BATCH_ROWS), 1))
+        shapes: dict[str, tuple[int, ...]] = {}
+        for batch, name in product(batches, kinds):
+            with contextlib.suppress(ConfigurationError):
+                shapes[name] = self._array(self._paths[0], name, batch.column(name)).shape[1:]
+        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {"": shapes}
+        self.left_out: Mapping[str, str] = {name: kind for name, kind in kinds.items() if name not in shapes}
+
+    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:  # noqa: ARG002, it has one
+        yield from self._batches(names)
+
+    def close(self) -> None:
+        """Do nothing: no file stays open."""
+
+    def _batches(self, names: Collection[str]) -> Iterator[Rows]:
+        done = 0
+        for path in self._paths:
+            with self._opened(path) as file:
+                try:
+                    for batch in file.iter_batches(_BATCH_ROWS, columns=list(names)):
+                        done += len(batch)
+                        self.share = done / self._rows
+                        yield {name: self._array(path, name, batch.column(name)) for name in names}
+                except (self._arrow.ArrowException, OSError, KeyError) as error:
+                    what = str(error).splitlines()[0]
+                    raise ConfigurationError(f"{path}: damaged after row {done} ({what}): write it again") from None
+
+    def _opened(self, path: Path) -> Any:
+        try:
+            return self._arrow.parquet.ParquetFile(path)
+        except self._arrow.ArrowException as error:
+            raise ConfigurationError(f"{path}: not Parquet, or damaged ({str(error).splitlines()[0]})") from None
+
+    def _array(self, path: Path, name: str, column: Any) -> npt.NDArray[Any]:
+        shape = [len(column)]
+        while hasattr(column.type, "value_field"):
+            sizes = set(package("pyarrow.compute", "Parquet").list_value_length(column).to_pylist())
+            if len(sizes) != 1 or None in sizes:
+                raise ConfigurationError(f"{path}: {name} has rows of different lengths: leave it out of the map")
+            shape, column = [*shape, *sizes], column.flatten()
+        numbers = column.to_numpy(zero_copy_only=False)
+        if numbers.dtype.kind not in "iufbM":
+            raise ConfigurationError(f"{path}: {name} is not numbers: leave it out of the map")
+        return _plain(numbers.reshape(shape))
+
+
+class DatasetSource(ParquetSource):
+    """A dataset of LeRobot (v3.0). Its column ``time_s`` has the episodes one after the other.
+
+    Attributes:
+        marks: ``time_s`` of the first row of each episode, and its name.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            info = json.loads((path / "meta" / "info.json").read_text(encoding="utf-8"))
+            version = str(info["codebase_version"])
+        except (ValueError, KeyError, TypeError):
+            raise ConfigurationError(f"{path}/meta/info.json: damaged: it does not say codebase_version") from None
+        if not version.startswith("v3"):
+            raise ConfigurationError(f"{path}: a dataset of LeRobot {version}: convert it to v3.0 with LeRobot first")
+        if not (path / "data").is_dir():
+            raise ConfigurationError(f"{path}: no folder data in it: fetch the whole dataset")
+        super().__init__(path / "data")
+        self.marks: list[tuple[float, str]] = []
+        self._begins: dict[int, float] = {}
+        end_s = -_EPISODE_GAP_S
+        for rows in self._batches(["episode_index", "timestamp"]):
+            episodes, times = rows["episode_index"].ravel(), rows["timestamp"].ravel().astype(np.float64)
+            for episode in dict.fromkeys(episodes.tolist()):
+                if episode not in self._begins:
+                    self._begins[episode] = end_s + _EPISODE_GAP_S
+                    self.marks.append((self._begins[episode], f"episode {episode}"))
+                end_s = self._begins[episode] + float(times[episodes == episode].max())
+        self.tables = {"": {**self.tables[""], TIME: ()}}
+
+    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
+        needed = {*names} - {TIME} | {"episode_index", "timestamp"}
+        for rows in super().blocks(table, needed):
+            begins = [self._begins[episode] for episode in rows["episode_index"].ravel().tolist()]
+            yield rows | {TIME: np.array(begins) + rows["timestamp"].ravel()}

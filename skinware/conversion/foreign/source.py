@@ -1,0 +1,60 @@
+"""Define what a source of foreign data is: tables of named columns, read a few rows at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+Rows = dict[str, npt.NDArray[Any]]
+"""m rows of columns, (m, ...) by name: numbers; times that a file has as such are int64 ns since 1970."""
+BLOCK_BYTES = 4 << 20
+"""Size of the rows that a source reads together."""
+
+
+class ColumnSource(Protocol):
+    """A file, or a folder of files, of another program.
+
+    Attributes:
+        tables: columns by the name of their table: the shape of a row, () for one number. All columns of a table have
+            equally many rows. The only table of a file has an empty name.
+        left_out: by name, why something in it is no column of numbers.
+        frames: by table, the name of the coordinate frame of its positions, where the source has one.
+        share: part of the last pass over a table that is done, 0 to 1.
+    """
+
+    path: Path
+    tables: Mapping[str, Mapping[str, tuple[int, ...]]]
+    left_out: Mapping[str, str]
+    frames: Mapping[str, str]
+    share: float
+
+    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
+        """Yield rows of some columns, a few at a time; each call begins again with the first.
+
+        Raises:
+            ConfigurationError: they are damaged; the message says where, and what to do.
+            OSError: they cannot be read.
+        """
+
+    def close(self) -> None:
+        """Close the files. Idempotent."""
+
+
+def whole(source: ColumnSource, table: str, name: str, most: int = 1 << 20) -> npt.NDArray[Any]:
+    """Return a column, (n, ...), or as many of its first rows as there are in ``most`` numbers."""
+    parts, count = [], 0
+    for rows in source.blocks(table, [name]):
+        parts.append(rows[name])
+        count += rows[name].size
+        if count >= most:
+            break
+    return np.concatenate(parts) if parts else np.zeros((0, *source.tables[table][name]))
+
+
+def first_rows(source: ColumnSource, table: str) -> Rows:
+    """Return the first rows of all columns of a table; none if it is empty."""
+    return next(source.blocks(table, source.tables[table]), {name: np.zeros(0) for name in source.tables[table]})

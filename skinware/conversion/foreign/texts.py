@@ -1,0 +1,213 @@
+"""Read texts of numbers: CSV with any separator, and the ``data.log`` of YARP's datadumper."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.conversion.foreign.source import Rows
+from skinware.errors import ConfigurationError
+
+_READ_BYTES = 1 << 20
+_SAMPLE_LINES = 200
+_SEPARATORS = ("\t", ";", ",")
+_MISSING = ("", "nan", "null", "none", "na", "n/a")
+_EXACT = 1 << 53
+"""From this number on, a float does not hold every integer."""
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d+)?Z?")
+_DUMPED = re.compile(r"\d+ \d+(\.\d+)? \S")
+_BRACKETS = str.maketrans("()", "  ")
+
+
+class TextSource:
+    """A text with a row of numbers in each line; an empty cell is NaN.
+
+    Names of columns are in its first line; without one they are ``column_0``, ``column_1`` ... Separators are tabs,
+    semicolons (then a comma is a decimal point), commas, or any white space.
+
+    Args:
+        path: of the text, in UTF-8.
+
+    Raises:
+        ConfigurationError: it is no such text.
+        OSError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.share = path, 0.0
+        self.frames: Mapping[str, str] = {}
+        with path.open("rb") as file:
+            lines = self._lines_of([file.readline(_READ_BYTES) for _ in range(_SAMPLE_LINES)], 0)
+        self._is_dump = path.name == "data.log" and any(map(_DUMPED.match, lines[:5]))
+        self._skipped = _heading(lines)
+        data = [line for line in lines[self._skipped :] if line.strip()]
+        if not data:
+            raise ConfigurationError(f"{path}: no line with numbers in it: is it a text, as CSV is?")
+        separators = (each for each in _SEPARATORS if each in data[0])
+        self._separator = None if self._is_dump else next(separators, None)
+        self._count = count = len(self._cells(self._clean(data[0])))
+        self._places = self._dumped(count) if self._is_dump else self._named(lines[: self._skipped], count)
+        rows = [cells for line in data if len(cells := self._cells(self._clean(line))) == count]
+        samples = {name: [cells[places[0]] for cells in rows] for name, places in self._places.items()}
+        self._dates = {name for name, cells in samples.items() if all(_DATE.fullmatch(cell.strip()) for cell in cells)}
+        self._exact = {name for name, cells in samples.items() if any(map(_is_large, cells))}
+        wrong = {name: [cell for cell in cells if _number(cell) is None] for name, cells in samples.items()}
+        self.left_out: Mapping[str, str] = {
+            name: f"{cells[0]!r} is no number"
+            for name, cells in wrong.items()
+            if name not in self._dates and len(cells) > len(rows) / 2
+        }
+        shapes = {
+            name: (len(places),) if self._is_dump and name == "value" else () for name, places in self._places.items()
+        }
+        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+            "": {name: shape for name, shape in shapes.items() if name not in self.left_out}
+        }
+
+    def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
+        size, at, number = max(self.path.stat().st_size, 1), 0, 1
+        with self.path.open("rb") as file:
+            for _ in range(self._skipped):
+                at, number = at + len(file.readline()), number + 1
+            while read := file.readlines(_READ_BYTES):
+                lines = list(map(self._clean, self._lines_of(read, at)))
+                at += sum(map(len, read))
+                self.share = at / size
+                rows = self._rows(lines, number, names)
+                yield {name: each.reshape(-1, *self.tables[table][name]) for name, each in rows}
+                number += len(read)
+
+    def close(self) -> None:
+        """Do nothing: no file stays open."""
+
+    # -- the form of the text -------------------------------------------------------------------------------------
+
+    def _named(self, head: Sequence[str], count: int) -> dict[str, list[int]]:
+        line = next((line for line in reversed(head) if line.strip()), "")
+        names = [name.strip() for name in self._cells(line.lstrip("# "))] or [""] * count
+        if len(names) != count:
+            self._damaged(self._skipped + 1, f"{count} cells under {len(names)} names")
+        names = [name or f"column_{number}" for number, name in enumerate(names)]
+        for name, often in Counter(names).items():
+            if often > 1:
+                self._damaged(self._skipped, f"{often} columns are called {name!r}")
+        return {name: [number] for number, name in enumerate(names)}
+
+    def _dumped(self, count: int) -> dict[str, list[int]]:
+        info = self.path.with_name("info.log")
+        has_both = info.exists() and "tx+rx" in info.read_text(errors="replace")
+        names = ["sequence", "time", *(["received_time"] * has_both)]
+        return {name: [number] for number, name in enumerate(names)} | {"value": list(range(len(names), count))}
+
+    def _clean(self, line: str) -> str:
+        if self._is_dump:
+            return line.translate(_BRACKETS)
+        return line.replace(",", ".") if self._separator == ";" else line
+
+    def _cells(self, line: str) -> list[str]:
+        if self._separator is None:
+            return line.split()
+        return next(csv.reader([line], delimiter=self._separator), [])
+
+    # -- rows -----------------------------------------------------------------------------------------------------
+
+    def _rows(self, lines: list[str], first: int, names: Collection[str]) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+        whole = [name for name in names if name in self._exact | self._dates]
+        floats = [name for name in names if name not in whole]
+        places = [self._places[name] for name in floats]
+        numbers = self._numbers(lines, first, [place for each in places for place in each])
+        ends = np.cumsum([len(each) for each in places]).tolist()
+        for name, each, end in zip(floats, places, ends, strict=True):
+            yield name, numbers[:, end - len(each) : end]
+        for name in whole:
+            yield name, self._whole_numbers(lines, first, name)
+
+    def _numbers(self, lines: list[str], first: int, places: list[int]) -> npt.NDArray[np.float64]:
+        """Return (m, len(places)) float64."""
+        if not places:
+            return np.zeros((len(lines), 0))
+        count, separator = self._count, self._separator
+        if separator is None:
+            is_even = all(len(line.split()) in (0, count) for line in lines)
+        else:
+            is_even = all(line.count(separator) == count - 1 or not line.strip() for line in lines)
+        if is_even:
+            try:
+                return np.loadtxt(lines, delimiter=separator, comments=None, quotechar='"', usecols=places, ndmin=2)
+            except ValueError:
+                pass  # an empty cell, or one to complain about
+        rows = [[self._float(cells[place], line) for place in places] for line, cells in self._split(lines, first)]
+        return np.array(rows, np.float64).reshape(-1, len(places))
+
+    def _whole_numbers(self, lines: list[str], first: int, name: str) -> npt.NDArray[np.int64]:
+        (place,), found = self._places[name], []
+        for line, cells in self._split(lines, first):
+            cell = cells[place].strip()
+            try:
+                is_date = name in self._dates
+                found.append(
+                    int(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64)) if is_date else int(cell)
+                )
+            except ValueError:
+                self._damaged(line, f"{cell!r} in {name} is neither a date nor an integer")
+        return np.array(found, np.int64)
+
+    def _split(self, lines: list[str], first: int) -> Iterator[tuple[int, list[str]]]:
+        for number, line in enumerate(lines, first):
+            cells = self._cells(line) if line.strip() else []
+            if cells and len(cells) != self._count:
+                self._damaged(number, f"{len(cells)} cells instead of {self._count}")
+            if cells:
+                yield number, cells
+
+    def _float(self, cell: str, line: int) -> float:
+        number = _number(cell)
+        if number is None:
+            self._damaged(line, f"{cell!r} is no number")
+        return number
+
+    def _lines_of(self, read: Sequence[bytes], at: int) -> list[str]:
+        data = b"".join(read)
+        try:
+            text = data.decode("utf-8-sig" if not at else "utf-8")
+        except UnicodeDecodeError as error:
+            raise ConfigurationError(f"{self.path}, byte {at + error.start}: no UTF-8: save it as UTF-8") from None
+        if "\0" in text:
+            where = at + data.index(b"\0")
+            raise ConfigurationError(f"{self.path}, byte {where}: not a text; what reads this file can export CSV")
+        return [line.rstrip("\r") for line in text.removesuffix("\n").split("\n")]
+
+    def _damaged(self, line: int, what: str) -> NoReturn:
+        raise ConfigurationError(f"{self.path}, line {line}: {what}: mend or remove the line")
+
+
+def _heading(lines: Sequence[str]) -> int:
+    """Return the number of lines before the first row."""
+    first = next((at for at, line in enumerate(lines) if line[:1] != "#" and any(_are_numbers(line))), len(lines))
+    if not first and len(lines) > 1:  # numbers may be names: those of cells above which another name is a word
+        first = int(any(under and not above for above, under in zip(*map(_are_numbers, lines[:2]), strict=False)))
+    return first
+
+
+def _are_numbers(line: str) -> list[bool]:
+    cells = [cell.strip('" ') for cell in re.split(r"[\t,;]| +", line.translate(_BRACKETS).strip(" "))]
+    return [bool(_DATE.match(f"{cell} 00:00:00")) or (bool(cell) and _number(cell) is not None) for cell in cells]
+
+
+def _number(cell: str) -> float | None:
+    """Return a number, NaN for an empty cell, None for anything else."""
+    try:
+        return float(cell)
+    except ValueError:
+        return np.nan if cell.strip().lower() in _MISSING else None
+
+
+def _is_large(cell: str) -> bool:
+    return cell.strip().isdecimal() and int(cell) >= _EXACT

@@ -1,0 +1,82 @@
+"""Emulated programs that publish touch on topics of ROS 2; the records of the bus ``dds``.
+
+Source of the messages: as of the peers in tests/streams/ros2_peer.py. A device is a topic: of a driver that was given
+one topic of any type it is the first.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
+
+_ROWS, _COLUMNS = 4, 6
+_N = _ROWS * _COLUMNS
+_TOPICS_APART = 64
+_NUMBERS = {"points": 0, "image": 1, "array": 2, "sensors": 26}
+"""Places of the message types in the driver's list."""
+_FRAME = b"palm\0"
+
+
+class EmulatedRos2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    topics: Annotated[tuple[int, ...], Meta(description="numbers of the driver's topics that are published")] = (0,)
+    message: Annotated[
+        Literal["array", "image", "points", "sensors"],
+        Meta(description="Float32MultiArray, Image, PointCloud2 or TactileState, of 4 x 6 taxels"),
+    ] = "array"
+    period_ms: Annotated[float, Meta(ge=1, description="time between two messages of a topic, ms")] = 20
+
+
+class EmulatedRos2(SerialEmulator[EmulatedRos2Options]):
+    full_scale = 4095
+    swing = 3000
+    speed_mbit_s = 100
+    streams = "always"
+    numbered_by = "topics"
+
+    def places(self) -> Places:
+        return on_a_grid(_N, _COLUMNS)
+
+    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
+        return f"topic{int.from_bytes(payload[6:8], 'little') // _TOPICS_APART}" if len(payload) > 6 else ""
+
+    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+        message = self.options.message
+        head = struct.pack("<iII", *divmod(device.sampled_ns, 10**9), len(_FRAME)) + _FRAME + bytes(3)
+        if message == "array":
+            dimensions = b"".join(_text(label) + struct.pack("<2I", size, size) for label, size in _DIMENSIONS)
+            sample = struct.pack("<I", 2) + dimensions + struct.pack(f"<2I{_N}f", 0, _N, *values)
+        elif message == "image":
+            picture = struct.pack(f"<{_N}H", *values)
+            shape = struct.pack("<3I", _ROWS, _COLUMNS, 7) + b"mono16\0" + b"\0"
+            sample = head + shape + struct.pack("<2I", 2 * _COLUMNS, len(picture)) + picture
+        elif message == "points":
+            points = b"".join(struct.pack("<4f", n % _COLUMNS, n // _COLUMNS, 0, one) for n, one in enumerate(values))
+            fields = b"".join(
+                _text(name) + struct.pack("<IB3xI", 4 * at, 7, 1) for at, name in enumerate(("x", "y", "z", "pressure"))
+            )
+            sample = head + struct.pack("<3I", 1, _N, 4) + fields + struct.pack("<B3x2I", 0, 16, 16 * _N)
+            sample += struct.pack("<I", len(points)) + points + b"\1"
+        else:
+            sample = head + struct.pack("<I", 2)
+            for at, name in enumerate(("thumb", "index")):
+                half = values[at * _N // 2 : (at + 1) * _N // 2]
+                sample += _text(name) + struct.pack(f"<I{len(half)}f", len(half), *half)
+        sample = b"\0\1\0\0" + sample
+        stamp = device.sampled_ns // 10_000 & 0xFFFF_FFFF
+        number = device.number * _TOPICS_APART + _NUMBERS[message]
+        record = struct.pack("<2sIHI", b"\xdd\x5a", 16 + len(sample), number, stamp) + sample
+        return [record + struct.pack("<I", zlib.crc32(record))]
+
+
+_DIMENSIONS = (("rows", _ROWS), ("columns", _COLUMNS))
+
+
+def _text(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)

@@ -1,0 +1,436 @@
+"""Data of other programs as recordings: each value as numpy, pyarrow or rosbags wrote it, or a clear line."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Writer2
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.stores import ros2_humble as ros
+
+import skinware.recording
+from skinware.cli._command import exit_status
+from skinware.cli.convert import command as skin_convert
+from skinware.conversion import convert_foreign
+from skinware.conversion.foreign import guess, open_source
+from skinware.conversion.foreign.source import whole
+from skinware.errors import ConfigurationError
+from skinware.recording import Series
+from skinware.status import Status
+
+N = 300
+TIMES = np.arange(N) * 0.01
+EPOCH_NS = 1_700_000_000_000_000_000
+SHARED = Path(os.environ.get("SKINWARE_SHARED_DATA", Path(__file__).parents[3] / "shared" / "data"))
+
+
+def imported(source: Path, changes: Callable[[str], str] = lambda text: text) -> dict[str, Series]:
+    """Convert by the guessed map, changed by hand; return what was recorded of each driver."""
+    with contextlib.closing(open_source(source)) as columns:
+        text = changes(guess(columns))
+    place = source.parent
+    map_path, target = place / "map.toml", place / "made.mcap"
+    map_path.write_text(text)
+    target.unlink(missing_ok=True)
+    converted = convert_foreign(source, target, "mcap", map_path)
+    with skinware.recording.open(target) as recording:
+        assert recording.problems == []
+        found = {name: recording[name].read() for name in recording.services}
+    assert {name: len(series) for name, series in found.items()} == converted.frames
+    return found
+
+
+def only(source: Path, changes: Callable[[str], str] = lambda text: text) -> Series:
+    (series,) = imported(source, changes).values()
+    return series
+
+
+def require(series: Series, values: npt.NDArray[Any], times: npt.NDArray[Any] = TIMES) -> None:
+    np.testing.assert_array_equal(series.column("values"), values)
+    assert not series.column("status").any()
+    np.testing.assert_allclose(series.time_s, times, rtol=0, atol=2e-7)
+
+
+# -- CSV ----------------------------------------------------------------------------------------------------------
+
+
+def write_csv(path: Path, names: list[str], rows: npt.NDArray[Any], **how: Any) -> None:
+    np.savetxt(path, rows, **{"delimiter": ",", "header": ",".join(names), "comments": "", "fmt": "%.17g", **how})
+
+
+def counts(*shape: int) -> npt.NDArray[np.int64]:
+    return np.random.default_rng(4).integers(0, 4096, shape)
+
+
+def test_csv(tmp_path: Path) -> None:
+    values = counts(N, 12)
+    path = tmp_path / "Data set.csv"
+    write_csv(path, ["time", *(f"taxel_{n}" for n in range(12))], np.column_stack([TIMES, values]))
+    ((name, series),) = imported(path).items()
+    require(series, values)
+    assert (name, series.structure.dtype.name, series.structure.n_modules) == ("data-set", "int32", 1)
+    assert series.structure.sensor_names("pressure") == [f"data-set, taxel {n}" for n in range(12)]
+
+
+def test_matrices_axes_and_units_by_names(tmp_path: Path) -> None:
+    names = ["t_ms", *(f"f{f}_{r}_{c}_n" for f in range(2) for r in range(3) for c in range(4)), "joint_0"]
+    names += [f"tip{n}_{axis}" for n in range(2) for axis in "xyz"]
+    values = np.random.default_rng(5).normal(size=(N, 31)).astype(np.float32)
+    path = tmp_path / "grid.csv"
+    write_csv(path, names, np.column_stack([TIMES * 1000, values]))
+    series = only(path)
+    wanted = [*range(24), 25, 28, 26, 29, 27, 30]  # matrices, then x, y and z of the tips
+    require(series, values[:, wanted])
+    structure = series.structure
+    assert structure.type("pressure").unit == "N"
+    assert structure.matrices("pressure")["f, 1"].tolist() == np.arange(12, 24).reshape(3, 4).tolist()
+    assert structure.sensor_names("force_z") == ["tip, taxel 0", "tip, taxel 1"]
+
+
+@pytest.mark.parametrize("how", [{"delimiter": "\t"}, {"delimiter": " "}, {"delimiter": ";"}, {"comments": "# "}])
+def test_other_separators(tmp_path: Path, how: dict[str, str]) -> None:
+    values, separator = counts(N, 3), how.get("delimiter", ",")
+    path = tmp_path / "data.txt"
+    write_csv(path, [], np.column_stack([TIMES, values]), header=separator.join(["time", "s_0", "s_1", "s_2"]), **how)
+    if separator == ";":  # as spreadsheets in some countries write it
+        path.write_text(path.read_text().replace(".", ","))
+    require(only(path), values)
+
+
+def test_missing_values_keep_the_last_one(tmp_path: Path) -> None:
+    path = tmp_path / "gaps.csv"
+    path.write_text("time,taxel_0,taxel_1\n0,,5\n1,1,\n2,nan,7\n3,4,8\n")
+    map_path = tmp_path / "map.toml"
+    map_path.write_text(guess(open_source(path)))
+    notes = convert_foreign(path, None, "mcap", map_path).notes
+    with skinware.recording.open(tmp_path / "gaps.mcap") as recording:
+        series = recording["gaps"].read()
+    assert series.column("values").tolist() == [[0, 5], [1, 5], [1, 7], [4, 8]]
+    assert series.column("status").tolist() == [[Status.NEVER_SEEN, 0], [0, Status.STALE], [Status.STALE, 0], [0, 0]]
+    assert notes == [f"{path}: 3 missing values of gaps keep the value before, with the status STALE"]
+
+
+def test_times_since_1970_are_exact(tmp_path: Path) -> None:
+    times_ns = EPOCH_NS + np.arange(N) * 10_000_001
+    path = tmp_path / "epoch.csv"
+    path.write_text("stamp,label,taxel_0\n" + "".join(f"{t},cup,{n}\n" for n, t in enumerate(times_ns.tolist())))
+    series = only(path)
+    require(series, np.arange(N)[:, None], (times_ns - EPOCH_NS) / 1e9)
+    with skinware.recording.open(tmp_path / "made.mcap") as recording:
+        assert recording.start_ns == EPOCH_NS
+    assert np.diff(series.column("module_time_ns")[:, 0]).tolist() == [10_000_001] * (N - 1)
+    dates = (np.datetime64(0, "ns") + times_ns).astype("datetime64[us]")
+    path.write_text("time,taxel_0\n" + "".join(f"{date}Z,{n}\n" for n, date in enumerate(dates)))
+    require(only(path), np.arange(N)[:, None], times_ns // 1000 / 1e6 - EPOCH_NS / 1e9)
+
+
+def test_without_times_a_rate_is_needed(tmp_path: Path) -> None:
+    path = tmp_path / "untimed.csv"
+    write_csv(path, ["taxel_0", "taxel_1"], counts(N, 2))
+    require(only(path, lambda text: text.replace("rate_hz = 100", "rate_hz = 50")), counts(N, 2), TIMES * 2)
+
+
+# -- arrays and tables --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "f4", "f8", ">i2", "?"])
+def test_npz(tmp_path: Path, dtype: str) -> None:
+    values = (counts(N, 4, 6) % 100).astype(dtype)
+    places = np.random.default_rng(6).random((24, 3)) / 10
+    path = tmp_path / "hand.npz"
+    np.savez(path, timestamp=EPOCH_NS + np.arange(N) * 10_000_000, palm_tactile=values, positions=places, name="x")
+    series = only(path)
+    require(series, values.reshape(N, 24))
+    assert series.structure.matrices("pressure").keys() == {"palm tactile"}
+    assert series.structure.geometry is not None
+    np.testing.assert_array_equal(series.structure.geometry.position_m, places)
+
+
+def test_npz_in_columns_compressed_and_of_three_axes(tmp_path: Path) -> None:
+    values = np.random.default_rng(7).normal(size=(N, 5, 3)).astype(np.float32)
+    path = tmp_path / "forces.npz"
+    np.savez_compressed(path, t=TIMES, forces=np.asfortranarray(values))
+    series = only(path)
+    require(series, values.transpose(0, 2, 1).reshape(N, 15))
+    assert [each.name for each in series.structure.types] == ["force_x", "force_y", "force_z"]
+
+
+def test_parquet(tmp_path: Path) -> None:
+    values, matrix = counts(N, 2), counts(N, 3, 4).astype(np.int16)
+    lists = pa.array(matrix.tolist(), pa.list_(pa.list_(pa.int16())))
+    fixed = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 2)
+    stamps = pa.array(EPOCH_NS + np.arange(N) * 10_000_000, pa.timestamp("ns"))
+    table = pa.table(
+        {"timestamp": stamps, "touch": fixed, "skin": lists, "who": ["x"] * N, "ragged": [[0]] + [[]] * (N - 1)}
+    )
+    pa.parquet.write_table(table, tmp_path / "a.parquet", row_group_size=70)
+    require(only(tmp_path / "a.parquet"), np.concatenate([values, matrix.reshape(N, 12)], axis=1))
+    folder = tmp_path / "parts"
+    folder.mkdir()
+    for number, first in enumerate(range(0, N, 100)):
+        pa.parquet.write_table(table.slice(first, 100), folder / f"{number}.parquet")
+    require(only(folder), np.concatenate([values, matrix.reshape(N, 12)], axis=1))
+
+
+def write_dataset(folder: Path, lengths: list[int], version: str = "v3.0") -> npt.NDArray[np.float32]:
+    values = np.random.default_rng(8).random((sum(lengths), 6)).astype(np.float32)
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps({"codebase_version": version, "fps": 10}))
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    steps = [step for length in lengths for step in range(length)]
+    table = pa.table(
+        {
+            "observation.tactile.left": list(values),
+            "observation.state": [[0.0, 1.0]] * len(steps),
+            "timestamp": np.array(steps, np.float32) / 10,
+            "frame_index": steps,
+            "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+            "index": np.arange(len(steps)),
+        }
+    )
+    middle = len(steps) // 2  # in an episode
+    for number, part in enumerate((table.slice(0, middle), table.slice(middle))):
+        pa.parquet.write_table(part, folder / "data" / "chunk-000" / f"file-{number:03d}.parquet")
+    return values
+
+
+def test_a_dataset_of_lerobot(tmp_path: Path) -> None:
+    values = write_dataset(tmp_path / "set", [20, 31, 15])
+    series = only(tmp_path / "set")
+    starts = np.repeat([0, 1.9 + 1, 1.9 + 1 + 3.0 + 1], [20, 31, 15])
+    steps = np.concatenate([np.arange(length, dtype=np.float32) / np.float32(10) for length in (20, 31, 15)])
+    require(series, values, starts + steps)
+    with skinware.recording.open(tmp_path / "made.mcap") as recording:
+        marks = [(event["text"], round(event["time_s"], 6)) for event in recording.events]
+    assert marks == [("episode 0", 0.0), ("episode 1", 2.9), ("episode 2", 6.9)]
+
+
+# -- bags ---------------------------------------------------------------------------------------------------------
+
+
+def stamped(number: int) -> Any:
+    time_ns = EPOCH_NS + number * 10_000_000
+    return ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(time_ns // 10**9, time_ns % 10**9), "palm")
+
+
+def messages(points: npt.NDArray[np.float32], image: npt.NDArray[np.uint16], numbers: npt.NDArray[np.float32]) -> Any:
+    field = ros.sensor_msgs__msg__PointField
+    fields = [field(name, 4 * place, 7, 1) for place, name in enumerate(("x", "y", "z", "pressure"))]
+    layout = ros.std_msgs__msg__MultiArrayLayout([], 0)
+    for number in range(len(points)):
+        data = points[number].tobytes()
+        cloud = ros.sensor_msgs__msg__PointCloud2(
+            stamped(number), 1, points.shape[1], fields, False, 16, len(data), np.frombuffer(data, np.uint8), True
+        )
+        rows, columns = image[number].shape
+        data = image[number].tobytes()
+        picture = ros.sensor_msgs__msg__Image(
+            stamped(number), rows, columns, "mono16", 0, 2 * columns, np.frombuffer(data, np.uint8)
+        )
+        yield number, "/cloud", cloud
+        yield number, "/skin_image", picture
+        if not number % 2:
+            yield number, "/touch", ros.std_msgs__msg__Float32MultiArray(layout, numbers[number])
+
+
+def write_bag(path: Path, kind: str, made: Any) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    writer: Any
+    if kind == "ros1":
+        writer, serialize = Writer1(path), store.serialize_ros1
+    else:
+        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+        writer, serialize = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    with writer:
+        connections: dict[str, Any] = {}
+        for number, topic, message in made:
+            name = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            if kind == "ros1" and hasattr(message, "header"):
+                message = as_ros1(store, message)
+            writer.write(connections[topic], EPOCH_NS + number * 10_000_000 + 500, serialize(message, name))
+
+
+def as_ros1(store: Any, message: Any) -> Any:
+    """With the header of ROS 1, which has a number."""
+    header = message.header
+    message.header = store.types["std_msgs/msg/Header"](0, header.stamp, header.frame_id)
+    return message
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
+def test_bags(tmp_path: Path, kind: str) -> None:
+    generator = np.random.default_rng(9)
+    points = np.concatenate([np.tile(generator.random((1, 8, 3)), (40, 1, 1)), generator.random((40, 8, 1))], axis=2)
+    points = points.astype(np.float32)
+    image, numbers = generator.integers(0, 60000, (40, 3, 4)).astype(np.uint16), generator.random((40, 7)).astype("f4")
+    path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+    write_bag(path, kind, messages(points, image, numbers))
+    found = imported(path)
+    assert found.keys() == {"cloud", "skin-image", "touch"}
+    require(found["cloud"], points[:, :, 3], TIMES[:40])
+    geometry = found["cloud"].structure.geometry
+    assert geometry is not None
+    np.testing.assert_array_equal(geometry.position_m, points[0, :, :3].astype(np.float64))
+    assert set(geometry.frame) == {"palm"}
+    require(found["skin-image"], image.reshape(40, 12), TIMES[:40])
+    require(found["touch"], numbers[::2], TIMES[:40:2] + 5e-7)  # when they were recorded
+    if kind == "mcap":  # the file in the folder alone
+        (inner,) = path.glob("*.mcap")
+        require(imported(inner)["cloud"], points[:, :, 3], TIMES[:40])
+
+
+def test_a_topic_whose_shape_changes(tmp_path: Path) -> None:
+    layout = ros.std_msgs__msg__MultiArrayLayout([], 0)
+    made = [
+        (number, "/touch", ros.std_msgs__msg__Float32MultiArray(layout, np.zeros(3 + (number == 2), np.float32)))
+        for number in range(4)
+    ]
+    write_bag(tmp_path / "walk", "mcap", made)
+    with pytest.raises(ConfigurationError, match=r"/touch, message 3: data has the shape \(4,\), and had \(3,\)"):
+        imported(tmp_path / "walk")
+
+
+# -- YARP ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stamp", ["rx", "tx+rx", "old"])
+def test_a_dump_of_yarp(tmp_path: Path, stamp: str) -> None:
+    values = counts(N, 12)
+    lines = ["Type: Bottle;"] if stamp == "old" else []
+    for number, row in enumerate(values.tolist()):
+        times = [f"{1_400_000_000 + number * 0.01:.6f}"] * (2 if stamp == "tx+rx" else 1)
+        text = " ".join(map(str, row))
+        lines.append(" ".join([str(number), *times, f"({text})" if number % 2 else text]))
+    (tmp_path / "data.log").write_text("\n".join(lines) + "\n")
+    if stamp != "old":
+        (tmp_path / "info.log").write_text(f"Type: Bottle;\nStamp: {stamp};\n[1400000000.0] /skin [connected]\n")
+    names = ["sequence", "time", *(["received_time"] if stamp == "tx+rx" else []), "value"]
+    assert list(open_source(tmp_path).tables[""]) == names
+    require(only(tmp_path / "data.log"), values)
+
+
+def real_dumps() -> list[Path]:
+    return sorted(SHARED.rglob("data.log")) if SHARED.exists() else []
+
+
+@pytest.mark.skipif(not real_dumps(), reason="no data.log of a robot here")
+def test_dumps_of_robots() -> None:
+    for path in real_dumps():
+        assert whole(open_source(path), "", "time").size
+
+
+# -- mistakes -----------------------------------------------------------------------------------------------------
+
+
+def damaged(name: str, make: Callable[[Path], object], words: str) -> Any:
+    return pytest.param(name, make, words, id=name)
+
+
+def cut(path: Path, write: Callable[[Path], object]) -> None:
+    write(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def later(text: str) -> Callable[[Path], object]:
+    """A text whose thousandth row has a mistake: after what is looked at first."""
+    rows = "".join(f"{n},{n}\n" for n in range(1000))
+    return lambda path: path.write_text(f"time,taxel_0\n{rows}{text}")
+
+
+MISTAKES = [
+    damaged("no.csv", lambda path: path.write_text("hello\nworld\n"), "no line with numbers in it"),
+    damaged("none.csv", lambda path: path.write_text(""), "no line with numbers in it"),
+    damaged("bin.csv", lambda path: path.write_bytes(b"time,a\n0,\x001\n"), "bin.csv, byte 9: not a text"),
+    damaged("latin.csv", lambda path: path.write_bytes(b"time,taxel_0\n0,1\n1,\xe9\n"), "latin.csv, byte 19: no UTF-8"),
+    damaged("text.csv", later("1000,x\n"), "text.csv, line 1002: 'x' is no number"),
+    damaged("few.csv", later("1000\n"), "few.csv, line 1002: 1 cells instead of 2"),
+    damaged("many.csv", later("1000,1,2\n"), "many.csv, line 1002: 3 cells instead of 2"),
+    damaged("back.csv", later("5,1\n"), "back.csv, row 1001: time goes back by 994 s"),
+    damaged("half.csv", later("1000,0.5\n"), "row 1001: 0.5 in taxel_0 is no int32: say another dtype"),
+    damaged("nan.csv", later("nan,1\n"), "row 1001: time nan is no time"),
+    damaged("a.h5", lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(50)), "HDF5 is not read"),
+    damaged("a.npy", lambda path: np.save(path, np.zeros(3)), "save it with numpy.savez"),
+    damaged("cut.npz", lambda path: cut(path, lambda path: np.savez(path, t=TIMES)), "not an NPZ file, or damaged"),
+    damaged("cut.parquet", lambda path: cut(path, lambda path: pa.parquet.write_table(pa.table({"t": TIMES}), path)),
+            "not Parquet, or damaged"),
+    damaged("old", lambda path: write_dataset(path, [3], "v2.1"), "a dataset of LeRobot v2.1: convert it to v3.0"),
+    damaged("empty", lambda path: path.mkdir(), "a folder without metadata.yaml"),
+    damaged("bad.bag", lambda path: path.write_bytes(b"#ROSBAG V2.0\n" + bytes(50)), "no bag of ROS, or damaged"),
+    damaged("bad.mcap", lambda path: path.write_bytes(b"\x89MCAP0\r\n" + bytes(50)), "no bag of ROS, or damaged"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "make", "words"), MISTAKES)
+def test_damaged_and_foreign_files_get_one_clear_line(
+    tmp_path: Path, name: str, make: Callable[[Path], object], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, map_path = tmp_path / name, tmp_path / "map.toml"
+    make(path)
+    map_path.write_text(MAP)
+    assert (
+        exit_status(skin_convert, [str(path), "--map", str(map_path), "--to", "mcap", "-o", str(tmp_path / "made")])
+        == 2
+    )
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("skin-convert: ")
+    assert words in err
+    assert err.count("\n") == 1
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == sorted([name, "map.toml"])
+
+
+MAP = """format = "skinware-columns"
+version = 1
+
+[[driver]]
+name = "hand"
+time = "time"
+dtype = "int32"
+
+[[driver.module]]
+patch = "palm"
+columns = ["taxel_0"]
+"""
+WRONG = [
+    ('time = "time"', 'time = "tine"', "map.toml:6: no column of numbers 'tine' in {}; did you mean 'time'?"),
+    ('columns = ["taxel_0"]', 'columns = ["taxel_{0..2}"]', "map.toml:11: no column of numbers 'taxel_2'"),
+    ('columns = ["taxel_0"]', 'columns = ["taxel_0[3]"]', "map.toml:11: "),
+    ('patch = "palm"', 'patch = "palm"\ntype = "presure"', "no sensor type 'presure'; did you mean 'pressure'?"),
+    ('patch = "palm"', 'patch = "palm"\ntaxels = [1, 2]', "2 taxels for the 1 numbers"),
+    ('patch = "palm"', 'patch = "palm"\nposition_m = [[0, 0, 0], [1, 0, 0]]', "2 places for the 1 taxels"),
+    ('name = "hand"', 'name = "hand"\ntable = "/x"', "has no table '/x'"),
+    ('time = "time"\n', "", "neither time nor rate_hz"),
+    ("version = 1", "version = 2", "version 2, this Skinware reads version 1"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), WRONG, ids=[words for _, _, words in WRONG])
+def test_a_wrong_map(tmp_path: Path, old: str, new: str, words: str) -> None:
+    path, map_path = tmp_path / "a.csv", tmp_path / "map.toml"
+    write_csv(path, ["time", "taxel_0", "taxel_1"], np.column_stack([TIMES, counts(N, 2)]))
+    map_path.write_text(MAP.replace(old, new))
+    with pytest.raises(ConfigurationError) as error:
+        convert_foreign(path, None, "mcap", map_path)
+    assert words.format(path) in str(error.value)
+
+
+def test_nothing_to_guess(tmp_path: Path) -> None:
+    path = tmp_path / "joints.csv"
+    write_csv(path, ["time", "joint_0"], np.column_stack([TIMES, counts(N, 1)]))
+    with pytest.raises(ConfigurationError, match="nothing looks like taxels; columns of numbers: time, joint_0"):
+        guess(open_source(path))

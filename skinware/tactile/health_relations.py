@@ -26,6 +26,8 @@ _HARD = 24.0
 """Times the noise: weaker touches do not show whether two taxels are the same."""
 _STEADY = 0.25
 """Share of a jump: neighbours that change less have not felt it."""
+_STILL_FRAMES = 5
+"""Frames without a large change before a value is lost: noise is large in each."""
 _BACK = 0.2
 """Share of a jump: the value is back if it differs by less from the one before."""
 _LOST_S = 2.0
@@ -63,7 +65,7 @@ class Dropouts:
         self._table = table
         self.count: Floats = np.zeros(len(table), np.float32)
         self._lost_s = np.full(len(table), -math.inf)
-        self._is_still: Flags = np.zeros(len(table), bool)
+        self._still: Whole = np.zeros(len(table), np.int64)
         self._before, self._lost = np.zeros((2, len(table)), np.float32)
 
     def add(self, now_s: float, before: Floats, given: Floats, at_end: Flags, calm: Calm, far: Floats) -> None:
@@ -78,7 +80,8 @@ class Dropouts:
             far: (n,) a difference from the baseline that is no noise.
         """
         jump = given - before
-        was_still, self._is_still = self._is_still, np.abs(jump) <= far
+        was_still = self._still >= _STILL_FRAMES
+        self._still = np.where(np.abs(jump) <= far, self._still + 1, 0)
         moved = np.flatnonzero((np.abs(jump) > 2 * far) & calm.usable)
         if not len(moved):
             return

@@ -429,6 +429,18 @@ def test_a_wrong_map(tmp_path: Path, old: str, new: str, words: str) -> None:
     assert words.format(path) in str(error.value)
 
 
+def test_many_columns_with_numbers_are_taxels_beside_one_with_a_name(tmp_path: Path) -> None:
+    path, taxels = tmp_path / "data.csv", [f"f1_{row}_{column}" for row in range(4) for column in range(4)]
+    head = ["time", *taxels, "joint_0", "joint_1", "joint_2", "joint_3", "temp_c"]
+    rows = [[f"{at / 50:.2f}", *["7"] * 20, "25.5"] for at in range(20)]
+    path.write_text("\n".join(",".join(row) for row in [head, *rows]) + "\n")
+    text = guess(open_source(path))
+    assert 'columns = ["f1_{0..3}_{0..3}"]' in text
+    assert 'kind = "4x4"' in text
+    assert 'unit = "degC"' in text
+    assert "not taken for taxels: joint_0, joint_1, joint_2, joint_3" in text
+
+
 def test_nothing_to_guess(tmp_path: Path) -> None:
     path = tmp_path / "joints.csv"
     write_csv(path, ["time", "joint_0"], np.column_stack([TIMES, counts(N, 1)]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -40,6 +41,8 @@ _UNITS = re.compile(r"[_.\s(\[](kpa|mpa|pa|mn|n|mt|ut|gauss|degc|g|mm|v|mv)[)\]]
 _UNIT_NAMES = {"kpa": "kPa", "mpa": "MPa", "pa": "Pa", "mn": "mN", "n": "N", "mt": "mT", "ut": "uT", "degc": "degC"}
 _AXIS = re.compile(r"(^|[_.\s])([xyz])(?=$|[_.\s\d])|(?<=[a-z])([XYZ])$")
 _NUMBER = re.compile(r"\d+")
+_MANY = 4
+"""Columns whose names differ in numbers and axes alone: so many are taxels, whatever they are called."""
 _GENERIC = ("", "taxel", "taxels", "sensor", "s", "t", "value", "values", "data", "column", "tactile")
 
 
@@ -90,8 +93,10 @@ def guess(source: ColumnSource) -> str:
 def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> list[str]:
     rows = tables[table]
     names = [name for name in rows if name != time]
-    wanted = [name for name in names if _TAXELS.search(name) and not _is_other(name)]
-    wanted = wanted or [name for name in names if not _is_other(name) and not _TIMES.fullmatch(name)]
+    possible = [name for name in names if not _is_other(name) and not _TIMES.fullmatch(name)]
+    pattern = {name: _NUMBER.sub("#", _AXIS.sub("", name)) for name in possible}
+    alike = Counter(pattern.values())
+    wanted = [name for name in possible if _TAXELS.search(name) or alike[pattern[name]] >= _MANY] or possible
     places = [name for name in names if name.lower() in ("x", "y", "z")]
     has_places = len(places) == 3 and rows[places[0]].ndim == 2
     wanted = [name for name in wanted if not (has_places and name in places)]
@@ -250,6 +255,8 @@ def _type_of(name: str, axis: str) -> tuple[str, str, str]:
     unit = _UNIT_NAMES.get(said[1].lower(), said[1].lower()) if said else "counts"
     for words, (type_name, axes) in _TYPES.items():
         if re.search(words, name, re.I):
+            if type_name == "temperature" and re.search(r"[_.\s(\[]c[)\]]?$", name, re.I):
+                unit = "degC"
             letter = axis if axis and axis in (axes or "xyz") else ("z" if not axes else "x")
             return type_name.format(letter), unit, f"{type_name.format(letter)} by its name"
     if axis:

@@ -1,18 +1,21 @@
-"""Cyclone DDS: join a domain, make types of their definitions, and write bytes."""
+"""Cyclone DDS: join a domain, make types of their definitions, write bytes, and wait for samples."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from cyclonedds.core import DDSException
+from cyclonedds.core import DDSException, GuardCondition, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl import types as idl
 from cyclonedds.qos import Qos
+from cyclonedds.util import duration
 
 from skinware.errors import BridgeError, ConfigurationError
 
@@ -25,6 +28,7 @@ try:
 except (ImportError, AttributeError):  # it is not public
     write_bytes = None
 
+_NEW = SampleState.NotRead | ViewState.Any | InstanceState.Any
 _FIELD = re.compile(
     r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<most><=)?(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE
 )
@@ -128,3 +132,52 @@ def _configuration(interfaces: Sequence[str]) -> str:
         f"<NetworkInterface {'address' if _ADDRESS.search(each) else 'name'}={quoteattr(each)}/>" for each in interfaces
     )
     return _NETWORK.format("".join(named))
+
+
+class WaitingThread:
+    """A thread that makes ``event`` readable when there is something to read, and waits again once ``go_on`` is set.
+
+    Threads of Cyclone DDS itself would wait for the interpreter. This one reads nothing.
+    """
+
+    def __init__(self, participant: DomainParticipant, reader: Any) -> None:
+        self.event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
+        self._conditions: dict[Any, ReadCondition] = {}
+        self._waitset.attach(self._woken)
+        self.watch(reader)
+        self.go_on, self._is_over = threading.Event(), False
+        self._thread = threading.Thread(target=self._run, name="skinware dds", daemon=True)
+        self._thread.start()
+
+    def watch(self, reader: Any) -> None:
+        """Wake up for what this reader has, too."""
+        self._conditions[reader] = condition = ReadCondition(reader, _NEW)
+        self._waitset.attach(condition)
+
+    def forget(self, reader: Any) -> None:
+        self._waitset.detach(self._conditions.pop(reader))
+
+    def calm_down(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.event)
+
+    def close(self) -> None:
+        if self._is_over:
+            return
+        self._is_over = True
+        self._woken.set(True)
+        self.go_on.set()
+        self._thread.join()
+        for condition in (*self._conditions.values(), self._woken):
+            self._waitset.detach(condition)
+        self._conditions.clear()
+        os.close(self.event)
+
+    def _run(self) -> None:
+        while not self._is_over:
+            self._waitset.wait(duration(infinite=True))
+            self.go_on.clear()
+            os.eventfd_write(self.event, 1)
+            if not self._is_over:
+                self.go_on.wait()

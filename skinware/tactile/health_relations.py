@@ -22,7 +22,7 @@ _MOST_EXCHANGED = 64
 """Weak taxels that are compared with each other."""
 _MOST_COMPARED = 1024
 """Touched taxels that are compared with their neighbours in one frame."""
-_HARD = 24.0
+_PLAIN = 24.0
 """Times the noise: weaker touches do not show whether two taxels are the same."""
 _STEADY = 0.25
 """Share of a jump: neighbours that change less have not felt it."""
@@ -287,7 +287,7 @@ class Twins:
             calm: what the baseline made of it.
             noise: standard deviation of the typical taxel.
         """
-        rows = np.flatnonzero(calm.touched & (above > _HARD * noise))[:_MOST_COMPARED]
+        rows = np.flatnonzero(calm.touched & (above > _PLAIN * noise))[:_MOST_COMPARED]
         if not len(rows) or not self._table.shape[1]:
             return
         around = self._table[rows]

@@ -18,7 +18,7 @@ from skinware.cli.replay import NAMESPACE, Playback, publish_again
 if TYPE_CHECKING:
     from skinware.recording import Recording
     from skinware_drivers.bus import Bus
-    from skinware_drivers.virtual.recorded import Wire
+    from skinware_drivers.virtual.recorded import WireSource
     from skinware_drivers.virtual.recorded_wire import RecordedWire
 
 _LONGEST_SLEEP_S = 0.05
@@ -132,14 +132,14 @@ def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace
         echo(f"{sender.sent.total()} frames sent{failed}")
 
 
-def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[Wire, Bus]]:
+def _pairs(recording: Recording, drivers: Sequence[str], buses: Sequence[str]) -> list[tuple[WireSource, Bus]]:
     from skinware.errors import ConfigurationError
     from skinware.wire import MOST_BYTES
     from skinware_drivers.registry import make_bus
     from skinware_drivers.virtual.recorded import wire_of
 
     driver = drivers[0] if len(drivers) == 1 else ""
-    pairs: list[tuple[Wire, Bus]] = []
+    pairs: list[tuple[WireSource, Bus]] = []
     for text in buses:
         names_one = any(text.startswith(f"{wire.bus}=") for wire in recording.wires)
         recorded, _, name = text.partition("=") if names_one else ("", "", text)
@@ -165,7 +165,7 @@ class WireSender:
 
     def __init__(
         self,
-        pairs: Sequence[tuple[Wire, Bus]],
+        pairs: Sequence[tuple[WireSource, Bus]],
         speed: float = 1.0,
         start_s: float = 0.0,
         end_s: float | None = None,

@@ -31,7 +31,7 @@ from skinware_drivers.proving.updates import Collected, Comparison, Decoding, co
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, package_on
-from skinware_drivers.virtual.recorded import Wire, medium_of, replayed_bus, wire_of
+from skinware_drivers.virtual.recorded import WireSource, medium_of, replayed_bus, wire_of
 
 _NAME = "captured"
 _SLOTS = 64
@@ -134,14 +134,14 @@ def _driver_type(recording: Recording, about: Mapping[str, Any]) -> str:
     return str(about["driver_type"])
 
 
-def _wires(recording: Recording) -> Sequence[Wire]:
+def _wires(recording: Recording) -> Sequence[WireSource]:
     if len({wire.driver for wire in recording.wires}) > 1:
         names = ", ".join(sorted({wire.driver for wire in recording.wires}))
         raise ConfigurationError(f"{recording.path}: wires of several drivers ({names}); a capture has one driver")
     return recording.wires or [wire_of(recording)]  # raises an error that names the reason
 
 
-def _began_ns(recording: Recording, wires: Sequence[Wire]) -> int:
+def _began_ns(recording: Recording, wires: Sequence[WireSource]) -> int:
     first = next((item for wire in wires for item in wire.items()), None)
     return 0 if first is None else first.time_ns - (first.epoch_ns - recording.start_ns)
 
@@ -156,7 +156,7 @@ class _ReplayedWire:
     def __init__(
         self,
         recording: Recording,
-        wire: Wire,
+        wire: WireSource,
         driver: type[AnyAdapter],
         options: Mapping[str, Any],
         listens: bool,

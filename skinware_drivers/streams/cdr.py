@@ -36,7 +36,7 @@ Indices = tuple[int, ...]
 """The elements of sequences within which a field is."""
 
 
-class Field(NamedTuple):
+class CdrField(NamedTuple):
     """A field of a definition.
 
     Attributes:
@@ -87,10 +87,10 @@ class Definitions:
     def __init__(self, type_name: str, texts: Mapping[str, str]) -> None:
         self.type_name = type_name = type_name.replace("/msg/", "/")
         self.texts: dict[str, str] = {}
-        self._fields: dict[str, Sequence[Field]] = {}
+        self._fields: dict[str, Sequence[CdrField]] = {}
         self._add(type_name, texts, ())
 
-    def __getitem__(self, type_name: str) -> Sequence[Field]:
+    def __getitem__(self, type_name: str) -> Sequence[CdrField]:
         return self._fields[type_name]
 
     def _add(self, type_name: str, texts: Mapping[str, str], outer: tuple[str, ...]) -> None:
@@ -112,9 +112,9 @@ class Definitions:
             if "/" in kind:
                 self._add(kind, texts, (*outer, type_name))
             lines.append(f"{kind}{bound or ''}{brackets or ''} {name}")
-            fields.append(Field(name, _CODES.get(kind, kind), _length(brackets, length)))
+            fields.append(CdrField(name, _CODES.get(kind, kind), _length(brackets, length)))
         if not fields:  # as ROS does
-            fields, lines = [Field("structure_needs_at_least_one_member", "u1", None)], [_EMPTY]
+            fields, lines = [CdrField("structure_needs_at_least_one_member", "u1", None)], [_EMPTY]
         self._fields[type_name], self.texts[type_name] = fields, "\n".join([*lines, ""])
 
 
@@ -130,7 +130,7 @@ def _length(brackets: str | None, length: str) -> int | None:
     return 0 if "<=" in brackets or not length else int(length)
 
 
-class Message:
+class CdrMessage:
     """A sample whose fields were found.
 
     Attributes:

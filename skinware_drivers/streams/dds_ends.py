@@ -1,15 +1,10 @@
-"""Both ends of a bus ``dds``: the participant that reads topics, and that of emulated devices, which publishes them.
-
-A thread waits for Cyclone DDS, whose own threads would wait for the interpreter. It reads nothing, and waits again only
-after the loop has read.
-"""
+"""Both ends of a bus ``dds``: the participant that reads topics, and that of emulated devices, which publishes them."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import os
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,17 +12,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
-from cyclonedds.core import DDSException, GuardCondition, InstanceState, ReadCondition, SampleState, ViewState, WaitSet
+from cyclonedds.core import DDSException, InstanceState
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
-from cyclonedds.util import duration
 
 from skinware.errors import BridgeError, BusNotAvailable
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.ros2.cyclone import join, reason, struct_type, write_bytes
+from skinware.ros2.cyclone import WaitingThread, join, reason, struct_type, write_bytes
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
@@ -48,7 +42,6 @@ _MOST_PUBLISHERS = 256
 _SILENT_NS = 2 * NS_PER_S
 _UNREAD_NS = 5 * NS_PER_S
 """Time after which a publisher that no reader has matched is reported."""
-_NEW = SampleState.NotRead | ViewState.Any | InstanceState.Any
 _MOST_LISTED = 4096
 _ALL_BITS = (1 << 64) - 1
 """Handles of matched publishers have a sign, those of samples have none."""
@@ -104,7 +97,7 @@ class DdsPort(Port):
         self._readers: dict[int, DataReader] = {}
         with _as_bus_error(name):
             self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-            self._waiting = _WaitingThread(self._participant, self._publications)
+            self._waiting = WaitingThread(self._participant, self._publications)
         self.change(topics)
 
     def fileno(self) -> int:
@@ -255,52 +248,6 @@ class DdsPort(Port):
         if source.reader == reader:
             source.heard_ns = time_ns
         return source.reader == reader
-
-
-class _WaitingThread:
-    """A thread that makes ``event`` readable when there is something to read, until ``go_on`` is set."""
-
-    def __init__(self, participant: DomainParticipant, reader: Any) -> None:
-        self.event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
-        self._conditions: dict[Any, ReadCondition] = {}
-        self._waitset.attach(self._woken)
-        self.watch(reader)
-        self.go_on, self._is_over = threading.Event(), False
-        self._thread = threading.Thread(target=self._run, name="skinware dds", daemon=True)
-        self._thread.start()
-
-    def watch(self, reader: Any) -> None:
-        """Wake up for what this reader has, too."""
-        self._conditions[reader] = condition = ReadCondition(reader, _NEW)
-        self._waitset.attach(condition)
-
-    def forget(self, reader: Any) -> None:
-        self._waitset.detach(self._conditions.pop(reader))
-
-    def calm_down(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self.event)
-
-    def close(self) -> None:
-        if self._is_over:
-            return
-        self._is_over = True
-        self._woken.set(True)
-        self.go_on.set()
-        self._thread.join()
-        for condition in (*self._conditions.values(), self._woken):
-            self._waitset.detach(condition)
-        self._conditions.clear()
-        os.close(self.event)
-
-    def _run(self) -> None:
-        while not self._is_over:
-            self._waitset.wait(duration(infinite=True))
-            self.go_on.clear()
-            os.eventfd_write(self.event, 1)
-            if not self._is_over:
-                self.go_on.wait()
 
 
 class DdsDeviceBus(SerialBus):

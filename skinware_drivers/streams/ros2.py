@@ -21,7 +21,6 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
-from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
@@ -33,10 +32,10 @@ from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.stream import Split
-from skinware_drivers.streams.cdr import Definitions, Message
+from skinware_drivers.streams.cdr import CdrMessage, Definitions
 from skinware_drivers.streams.dds import LONGEST, SOURCE_TIME, DdsAdapter, DdsTopic, TopicBus, samples
 from skinware_drivers.streams.ros2_map import guessed, preset, read_map, texts_of
-from skinware_drivers.streams.ros2_parts import MOST_VALUES, Making, Part
+from skinware_drivers.streams.ros2_parts import MOST_VALUES, Making, ModulePart, Plan
 from skinware_drivers.streams.ros2_presets import PRESETS, TEXTS
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -46,7 +45,7 @@ _TYPES = 64
 _MOST_TOPICS, _MOST_PARTS, _MOST_LISTED = 128, 190, 20
 _NEWS, _NO_MESSAGE = 0, 0x7FF
 _FIRST_S, _LISTEN_S, _AGAIN_S, _MOST_TOLD = 5.0, 0.05, 5.0, 16
-_STAMP_NS, _LIST_EVERY = 10_000, 64
+_LIST_EVERY = 64
 _NUMBER = struct.Struct("<H")
 _DTYPES = (np.uint8, np.int16, np.uint16, np.int32, np.float32)
 _NO_NUMBER = tuple(Sentinel(Status.SUSPECT, value) for value in (np.nan, np.inf, -np.inf))
@@ -98,8 +97,8 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         self._reading = {topic.number: (definitions, making) for topic, definitions, making in _topics(options)}
         self.topics = [topic for topic, *_ in _topics(options)]
         self.framing: Framing = Split(samples(LONGEST), self._split)
-        self._plans: dict[int, _Plan] = {}
-        self._parts: dict[Key, tuple[int, Part]] = {}
+        self._plans: dict[int, Plan] = {}
+        self._parts: dict[Key, tuple[int, ModulePart]] = {}
         self._uids: dict[Key, int] = {}
         self._identifiers: dict[Key, tuple[int, Any]] = {}
         self._described: Sequence[Patch] = ()
@@ -158,7 +157,7 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
                 self.change_framing(Split(samples(LONGEST), keep))
                 self._line.read_only(DdsTopic(name, heard[0], known.texts, _TYPES - 1))
             if kept and known is not None:
-                text = guessed(_in_ros(name), heard[0], Message(kept[0], known), known)
+                text = guessed(_in_ros(name), heard[0], CdrMessage(kept[0], known), known)
                 await asyncio.to_thread(Path(file).write_text, text, encoding="utf-8")
                 return f"{file}: {text.count('[[topic.values]]') or 'no'} fields of {heard[0]}; correct what it guesses"
             await link.sleep(_LISTEN_S)
@@ -271,7 +270,7 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         found = ((self._identifiers.get((part.patch, part.name), (0, 0)), part) for part in plan.parts)
         return [*news, *((known, stamp + part.body(sample)) for (known, form), part in found if form == part.form)]
 
-    def _is_known(self, plan: _Plan) -> bool:
+    def _is_known(self, plan: Plan) -> bool:
         """Return whether all modules of a message are described in this form."""
         return all(self._identifiers.get((part.patch, part.name), (0, 0))[1] == part.form for part in plan.parts)
 
@@ -280,12 +279,12 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         own = (known for key, (known, _) in self._identifiers.items() if self._parts[key][0] == number)
         return next(own, _NO_MESSAGE)
 
-    def _plan(self, number: int, sample: bytes) -> _Plan:
+    def _plan(self, number: int, sample: bytes) -> Plan:
         if number not in self._reading:
             raise ValueError("a topic that is not known")
         definitions, making = self._reading[number]
-        message = Message(sample, definitions)
-        plan, before = _Plan(message, making(message, self._name(number))), self._plans.get(number)
+        message = CdrMessage(sample, definitions)
+        plan, before = Plan(message, making(message, self._name(number))), self._plans.get(number)
         plan.messages = before.messages if before else 0
         self._plans[number] = plan
         return plan
@@ -297,36 +296,6 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         if text not in self._told and len(self._told) < _MOST_TOLD:
             self._told.add(text)
             log.warning("%s", text)
-
-
-class _Plan:
-    """The places of a message's values, which are the same in samples with the same lengths and texts.
-
-    Attributes:
-        messages: heard since this was set to 0.
-        listed: messages until one is passed on to those that want to learn it.
-    """
-
-    def __init__(self, message: Message, parts: Sequence[Part]) -> None:
-        pieces = [piece for part in parts for piece in part.pieces()]
-        self.parts: Sequence[Part] = list({(each.patch, each.name): each for each in reversed(pieces)}.values())[::-1]
-        self.messages = self.listed = 0
-        self._size, self._fixed = len(message.sample), message.fixed
-        self._as = np.frombuffer(message.sample, np.uint8)[self._fixed]
-        self._stamp = [message.numbers.get(f"header.stamp.{of}", {}).get(()) for of in ("sec", "nanosec")]
-
-    def fits(self, sample: bytes) -> bool:
-        return len(sample) == self._size and np.array_equal(np.frombuffer(sample, np.uint8)[self._fixed], self._as)
-
-    def period_s(self, duration_s: float) -> float:
-        """Return the time between messages, by how many came; 0 if none was counted, twice the duration if one was."""
-        return duration_s / max(self.messages - 1, 0.5) if self.messages else 0.0
-
-    def stamp(self, sample: bytes) -> bytes:
-        """Return the time of the header as a source's time; empty if there is none."""
-        seconds, nanoseconds = (0 if each is None else int(each.of(sample)[0]) for each in self._stamp)
-        time_ns = seconds * NS_PER_S + nanoseconds
-        return (time_ns // _STAMP_NS & 0xFFFF_FFFF).to_bytes(4, "little") if time_ns > 0 else b""
 
 
 def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Definitions, Making]]:
@@ -356,7 +325,7 @@ def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Definitions, Making]]:
     return found
 
 
-def _frame(number: int, part: Part, patch: int, *, is_timed: bool) -> Frame:
+def _frame(number: int, part: ModulePart, patch: int, *, is_timed: bool) -> Frame:
     count = part.taxels * len(part.types)
     end = SOURCE_TIME.end + count * part.dtype.itemsize
     flags: list[AnyFlag] = list(_NO_NUMBER) if part.dtype.kind == "f" else []
@@ -374,7 +343,7 @@ def _frame(number: int, part: Part, patch: int, *, is_timed: bool) -> Frame:
     )
 
 
-def _places(part: Part, position_m: npt.NDArray[np.float64], first_uid: int) -> Geometry:
+def _places(part: ModulePart, position_m: npt.NDArray[np.float64], first_uid: int) -> Geometry:
     n, k = part.taxels, len(part.types)
     normal = np.full((n, 3), np.nan) if part.normal is None else part.normal
     length = np.linalg.norm(normal, axis=1, keepdims=True)

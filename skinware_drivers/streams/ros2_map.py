@@ -35,8 +35,8 @@ import msgspec
 from skinware.errors import ConfigurationError
 from skinware.text import nearest_name
 from skinware.toml_text import TomlText
-from skinware_drivers.streams.cdr import Definitions, Message
-from skinware_drivers.streams.ros2_parts import Making, Rule, by_rules
+from skinware_drivers.streams.cdr import CdrMessage, Definitions
+from skinware_drivers.streams.ros2_parts import FieldRule, Making, by_rules
 from skinware_drivers.streams.ros2_presets import PRESETS, TEXTS
 
 _FORMAT, _VERSION = "skinware-ros2-map", 1
@@ -49,10 +49,10 @@ class MapTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     type: str
-    values: tuple[Rule, ...] = ()
+    values: tuple[FieldRule, ...] = ()
 
 
-class _MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _TopicMapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: str
     version: int
     topic: tuple[MapTopic, ...]
@@ -66,7 +66,7 @@ def read_map(path: str) -> list[tuple[MapTopic, Definitions, Making]]:
         ConfigurationError: the file cannot be read, or says something that cannot be; the message says where.
     """
     text = TomlText(Path(path))
-    file = text.of_format("map of topics", _FORMAT, _VERSION, _MapFile)
+    file = text.of_format("map of topics", _FORMAT, _VERSION, _TopicMapFile)
     texts = {**TEXTS, **file.definition}
     found = []
     for number, topic in enumerate(file.topic):
@@ -121,7 +121,7 @@ def texts_of(type_name: str, folder: str) -> Definitions:
             texts[missing[1]] = files[0].read_text(encoding="utf-8", errors="replace")
 
 
-def guessed(topic: str, type_name: str, message: Message, definitions: Definitions) -> str:
+def guessed(topic: str, type_name: str, message: CdrMessage, definitions: Definitions) -> str:
     """Return a map of a message: a module for each field of numbers; x, y and z are values of the same taxels."""
     lines = [f'format = "{_FORMAT}"', f"version = {_VERSION}", "", "[[topic]]", f'name = "{topic}"']
     lines += [f'type = "{type_name}"']
@@ -137,7 +137,7 @@ def guessed(topic: str, type_name: str, message: Message, definitions: Definitio
     return "\n".join(lines) + "\n"
 
 
-def _rules(message: Message) -> Iterator[Rule]:
+def _rules(message: CdrMessage) -> Iterator[FieldRule]:
     of_axes: dict[str, list[str]] = {}
     for name in message.numbers:
         if _NOT_SHOWN.search(name):
@@ -150,7 +150,7 @@ def _rules(message: Message) -> Iterator[Rule]:
             continue
         module = group.rstrip("._").replace(".", " ") or "values"
         if len(names) == 3:
-            yield Rule(tuple(names), ("force_x", "force_y", "force_z"), module=module, taxels=count)
+            yield FieldRule(tuple(names), ("force_x", "force_y", "force_z"), module=module, taxels=count)
         else:
             for name in names:
-                yield Rule(name, module=module if len(names) == 1 else name.replace(".", " "), taxels=count)
+                yield FieldRule(name, module=module if len(names) == 1 else name.replace(".", " "), taxels=count)

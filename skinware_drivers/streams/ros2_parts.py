@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware import sensor_types
+from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware.text import printable
-from skinware_drivers.streams.cdr import Indices, Message, gathered
+from skinware_drivers.streams.cdr import CdrMessage, Indices, gathered
 
 MOST_VALUES = 4096
 """Values of a part; a field with more becomes several."""
@@ -25,13 +26,14 @@ _CATALOGUE = {each.name: each for each in vars(sensor_types).values() if isinsta
 _VENDOR = 0x20520 << 12
 """The vendor of quantities that the catalogue lacks; their numbers follow from their names."""
 _PLACEHOLDER = re.compile(r"\{([\w.]+)\}")
+_STAMP_NS = 10_000
 _LONGEST_TEXT, _LONGEST_NAME, _BEGINNING = 48, 32, 12
 
 Places = npt.NDArray[np.int64]
 """First byte of each number of a column, in a sample."""
 
 
-class Rule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class FieldRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The meaning of a field, as in a map file.
 
     Attributes:
@@ -64,7 +66,7 @@ class Rule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True)
-class Part:
+class ModulePart:
     """The values of a module in a message.
 
     Attributes:
@@ -113,7 +115,7 @@ class Part:
         status = np.where((told == 0) == is_inverted, int(Status.SUSPECT), 0).astype(np.uint8)
         return values + np.repeat(status, len(self.types)).tobytes()
 
-    def pieces(self) -> list[Part]:
+    def pieces(self) -> list[ModulePart]:
         """Return this part, or parts of at most ``MOST_VALUES`` values, of whole rows if it has any; names are cut."""
         columns = int(self.kind.partition("x")[2] or 1) if re.fullmatch(r"\d+x\d+", self.kind) else 1
         most = max(1, MOST_VALUES // len(self.types) // columns) * columns
@@ -121,7 +123,7 @@ class Part:
             return [replace(self, patch=_short(self.patch), name=_short(self.name))]
         return [self._piece(first, min(first + most, self.taxels), columns) for first in range(0, self.taxels, most)]
 
-    def _piece(self, first: int, end: int, columns: int) -> Part:
+    def _piece(self, first: int, end: int, columns: int) -> ModulePart:
         rows = slice(first, end)
         return replace(
             self,
@@ -135,7 +137,38 @@ class Part:
         )
 
 
-Making = Callable[[Message, str], Sequence[Part]]
+class Plan:
+    """The places of a message's values, which are the same in samples with the same lengths and texts.
+
+    Attributes:
+        messages: heard since this was set to 0.
+        listed: messages until one is passed on to those that want to learn it.
+    """
+
+    def __init__(self, message: CdrMessage, parts: Sequence[ModulePart]) -> None:
+        pieces = [piece for part in parts for piece in part.pieces()]
+        by_name = {(each.patch, each.name): each for each in reversed(pieces)}
+        self.parts: Sequence[ModulePart] = list(by_name.values())[::-1]
+        self.messages = self.listed = 0
+        self._size, self._fixed = len(message.sample), message.fixed
+        self._as = np.frombuffer(message.sample, np.uint8)[self._fixed]
+        self._stamp = [message.numbers.get(f"header.stamp.{of}", {}).get(()) for of in ("sec", "nanosec")]
+
+    def fits(self, sample: bytes) -> bool:
+        return len(sample) == self._size and np.array_equal(np.frombuffer(sample, np.uint8)[self._fixed], self._as)
+
+    def period_s(self, duration_s: float) -> float:
+        """Return the time between messages, by how many came; 0 if none was counted, twice the duration if one was."""
+        return duration_s / max(self.messages - 1, 0.5) if self.messages else 0.0
+
+    def stamp(self, sample: bytes) -> bytes:
+        """Return the time of the header as a source's time; empty if there is none."""
+        seconds, nanoseconds = (0 if each is None else int(each.of(sample)[0]) for each in self._stamp)
+        time_ns = seconds * NS_PER_S + nanoseconds
+        return (time_ns // _STAMP_NS & 0xFFFF_FFFF).to_bytes(4, "little") if time_ns > 0 else b""
+
+
+Making = Callable[[CdrMessage, str], Sequence[ModulePart]]
 """Returns the parts of a message on a topic; raises ValueError if its contents make no sense."""
 
 
@@ -158,11 +191,11 @@ def check_count(count: int) -> None:
         raise ValueError(f"{count} values, of which at most {_MOST_OF_A_MESSAGE} can be shown: is it a camera?")
 
 
-def by_rules(*rules: Rule) -> Making:
+def by_rules(*rules: FieldRule) -> Making:
     """Return what makes parts by rules; the first rule that finds values of a module counts."""
 
-    def parts(message: Message, topic: str) -> Sequence[Part]:
-        found: dict[tuple[str, str], Part] = {}
+    def parts(message: CdrMessage, topic: str) -> Sequence[ModulePart]:
+        found: dict[tuple[str, str], ModulePart] = {}
         for rule in rules:
             for key, part in _of_rule(rule, message, topic).items():
                 found.setdefault(key, part)
@@ -171,7 +204,7 @@ def by_rules(*rules: Rule) -> Making:
     return parts
 
 
-def columns_of(message: Message, names: Sequence[str], within: Indices = ()) -> tuple[list[Places], list[str]]:
+def columns_of(message: CdrMessage, names: Sequence[str], within: Indices = ()) -> tuple[list[Places], list[str]]:
     """Return places and dtype of the numbers of each field, within an element of a sequence.
 
     Raises:
@@ -189,18 +222,18 @@ def columns_of(message: Message, names: Sequence[str], within: Indices = ()) -> 
     return places, dtypes
 
 
-def frame_of(message: Message, topic: str) -> str:
+def frame_of(message: CdrMessage, topic: str) -> str:
     return _name(message.texts.get("header.frame_id", {}).get((), "")) or topic
 
 
-def _of_rule(rule: Rule, message: Message, topic: str) -> dict[tuple[str, str], Part]:
+def _of_rule(rule: FieldRule, message: CdrMessage, topic: str) -> dict[tuple[str, str], ModulePart]:
     names = rule.fields
     quantities = (rule.quantity,) * len(names) if isinstance(rule.quantity, str) else rule.quantity
     units = (rule.unit,) * len(names) if isinstance(rule.unit, str) else rule.unit
     if len(quantities) != len(names) or len(units) != len(names):
         raise ValueError(f"give a quantity and a unit for each of the {len(names)} fields {', '.join(names)}")
     types = tuple(sensor_type(quantity, unit) for quantity, unit in zip(quantities, units, strict=True))
-    found: dict[tuple[str, str], Part] = {}
+    found: dict[tuple[str, str], ModulePart] = {}
     for within in _elements(rule.each, message):
         places, dtypes = columns_of(message, names, within)
         count = len(places[0])
@@ -217,7 +250,7 @@ def _of_rule(rule: Rule, message: Message, topic: str) -> dict[tuple[str, str], 
         position = _vectors(message, rule.position, within, count)
         normal = _vectors(message, rule.normal, within, count)
         frame = frame_of(message, topic)
-        found[key] = Part(
+        found[key] = ModulePart(
             key[0],
             key[1],
             kind,
@@ -232,14 +265,14 @@ def _of_rule(rule: Rule, message: Message, topic: str) -> dict[tuple[str, str], 
     return found
 
 
-def _elements(each: str, message: Message) -> Iterator[Indices]:
+def _elements(each: str, message: CdrMessage) -> Iterator[Indices]:
     if not each:
         yield ()
     for within, count in message.counts.get(each, {}).items():
         yield from ((*within, element) for element in range(count))
 
 
-def _module_name(rule: Rule, message: Message, within: Indices) -> str:
+def _module_name(rule: FieldRule, message: CdrMessage, within: Indices) -> str:
     def contents(match: re.Match[str]) -> str:
         if match[1] in message.texts:
             return message.texts[match[1]].get(within, "")
@@ -250,7 +283,7 @@ def _module_name(rule: Rule, message: Message, within: Indices) -> str:
 
 
 def _vectors(
-    message: Message, names: tuple[str, str, str] | None, within: Indices, count: int
+    message: CdrMessage, names: tuple[str, str, str] | None, within: Indices, count: int
 ) -> npt.NDArray[np.float64] | None:
     """Return (count, 3) float64 of three fields, NaN where one is not finite; None if there are no such fields."""
     if names is None:
@@ -267,7 +300,7 @@ def vectors(sample: bytes, places: Sequence[Places], dtypes: Sequence[str]) -> n
     return np.where(np.isfinite(found).all(axis=1, keepdims=True), found, np.nan)
 
 
-def _doubt(status: str, message: Message, within: Indices, count: int) -> tuple[Places, str, bool] | None:
+def _doubt(status: str, message: CdrMessage, within: Indices, count: int) -> tuple[Places, str, bool] | None:
     if not status:
         return None
     [places], [dtype] = columns_of(message, [status.removeprefix("!")], within)

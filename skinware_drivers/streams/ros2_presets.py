@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from skinware_drivers.streams.cdr import Message
+from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.ros2_parts import (
+    FieldRule,
     Making,
-    Part,
+    ModulePart,
     Places,
-    Rule,
     by_rules,
     check_count,
     frame_of,
@@ -95,7 +95,7 @@ _NAMED_IMAGES = {"mono8": "8UC1", "mono16": "16UC1", **dict.fromkeys(("rgb8", "b
 _XELA_GRID = re.compile(r"(?:uSPa|XR19|XR18)(\d)(\d)")
 
 
-def _cloud(message: Message, topic: str) -> Sequence[Part]:
+def _cloud(message: CdrMessage, topic: str) -> Sequence[ModulePart]:
     """Make one part of the fields of points, with places if there are x, y and z."""
     height, width, step, row_step = (message.number(name) for name in ("height", "width", "point_step", "row_step"))
     data, order = message.numbers["data"][()], "<>"[bool(message.number("is_bigendian"))]
@@ -129,7 +129,7 @@ def _cloud(message: Message, topic: str) -> Sequence[Part]:
     return [replace(part, position_m=position, normal=normal, frame=frame_of(message, topic))]
 
 
-def _image(message: Message, topic: str) -> Sequence[Part]:
+def _image(message: CdrMessage, topic: str) -> Sequence[ModulePart]:
     """Make a matrix of a picture."""
     encoding = message.texts["encoding"][()]
     match = _IMAGE.fullmatch(_NAMED_IMAGES.get(encoding, encoding))
@@ -148,7 +148,7 @@ def _image(message: Message, topic: str) -> Sequence[Part]:
     return [_part(topic, "image", f"{height}x{width}", columns)]
 
 
-def _array(message: Message, topic: str) -> Sequence[Part]:
+def _array(message: CdrMessage, topic: str) -> Sequence[ModulePart]:
     """Make taxels of an array: of two dimensions a matrix; of three with 3 at last, one of taxels with three axes."""
     data = message.numbers["data"][()]
     sizes = [message.number("layout.dim.size", (element,)) for element in range(message.counts["layout.dim"][()])]
@@ -164,13 +164,13 @@ def _array(message: Message, topic: str) -> Sequence[Part]:
     return [_part(topic, "array", f"{shape[0]}x{shape[1]}" if shape else "taxels", columns)]
 
 
-def _part(topic: str, name: str, kind: str, columns: Sequence[tuple[str, Places, str]]) -> Part:
+def _part(topic: str, name: str, kind: str, columns: Sequence[tuple[str, Places, str]]) -> ModulePart:
     """Return a part of columns: quantity, places and dtype of each."""
     names, places, dtypes = zip(*columns, strict=True)
-    return Part(topic, name, kind, tuple(sensor_type(each, "counts") for each in names), places, dtypes)
+    return ModulePart(topic, name, kind, tuple(sensor_type(each, "counts") for each in names), places, dtypes)
 
 
-def _xela(message: Message, topic: str) -> Sequence[Part]:
+def _xela(message: CdrMessage, topic: str) -> Sequence[ModulePart]:
     parts = _xela_sensors(message, topic)
     grids = [(part, _XELA_GRID.search(part.name)) for part in parts]
     return [
@@ -185,7 +185,7 @@ def _xyz(prefix: str) -> tuple[str, str, str]:
 
 _xela_sensors = by_rules(
     *(
-        Rule(_xyz(f"sensors.{field}"), names, unit, module="{sensors.model} {sensors.sensor_pos}", each="sensors")
+        FieldRule(_xyz(f"sensors.{field}"), names, unit, module="{sensors.model} {sensors.sensor_pos}", each="sensors")
         for field, names, unit in (
             ("forces", _FORCE, "N"),
             ("taxels", ("shear_x", "shear_y", "pressure"), "counts"),
@@ -197,34 +197,34 @@ _xela_sensors = by_rules(
 def _contact(prefix: str, each: str) -> Making:
     fields = (*_xyz(f"{prefix}wrench.force"), *_xyz(f"{prefix}wrench.torque"), *_xyz(f"{prefix}position"))
     quantities = _FORCE + _TORQUE + ("position_x", "position_y", "position_z")
-    return by_rules(Rule(fields, quantities, (*_NEWTONS, *("m",) * 3), module=f"{{{prefix}name}}", each=each))
+    return by_rules(FieldRule(fields, quantities, (*_NEWTONS, *("m",) * 3), module=f"{{{prefix}name}}", each=each))
 
 
 def _wrench(prefix: str) -> Making:
     fields = (*_xyz(f"{prefix}force"), *_xyz(f"{prefix}torque"))
-    return by_rules(Rule(fields, _FORCE + _TORQUE, _NEWTONS, module="wrench"))
+    return by_rules(FieldRule(fields, _FORCE + _TORQUE, _NEWTONS, module="wrench"))
 
 
 _MAKINGS: Mapping[str, Making] = {
     "sensor_msgs/PointCloud2": _cloud,
     "sensor_msgs/Image": _image,
     **{f"std_msgs/{name}MultiArray": _array for name in _NUMBERS},
-    **{f"std_msgs/{name}": by_rules(Rule("data", module="value")) for name in _NUMBERS},
+    **{f"std_msgs/{name}": by_rules(FieldRule("data", module="value")) for name in _NUMBERS},
     "geometry_msgs/WrenchStamped": _wrench("wrench."),
     "geometry_msgs/Wrench": _wrench(""),
-    "sensor_msgs/FluidPressure": by_rules(Rule("fluid_pressure", unit="Pa", module="pressure")),
+    "sensor_msgs/FluidPressure": by_rules(FieldRule("fluid_pressure", unit="Pa", module="pressure")),
     "sensor_msgs/MagneticField": by_rules(
-        Rule(_xyz("magnetic_field"), tuple(f"magnetic_field_{axis}" for axis in _AXES), "T", module="magnetometer")
+        FieldRule(_xyz("magnetic_field"), tuple(f"magnetic_field_{axis}" for axis in _AXES), "T", module="magnetometer")
     ),
-    "tactile_msgs/TactileState": by_rules(Rule("sensors.values", module="{sensors.name}", each="sensors")),
+    "tactile_msgs/TactileState": by_rules(FieldRule("sensors.values", module="{sensors.name}", each="sensors")),
     "tactile_msgs/TactileContact": _contact("", ""),
     "tactile_msgs/TactileContacts": _contact("contacts.", "contacts"),
     "xela_server_ros2/SensStream": _xela,
     "inspire/inspire_hand_touch": by_rules(
-        *(Rule(field, module=name, taxels=taxels) for field, (name, taxels) in _INSPIRE.items())
+        *(FieldRule(field, module=name, taxels=taxels) for field, (name, taxels) in _INSPIRE.items())
     ),
     "paxini_hardware/TactileSensor": by_rules(
-        Rule(
+        FieldRule(
             _xyz("taxels.force"),
             _FORCE,
             "N",
@@ -232,7 +232,7 @@ _MAKINGS: Mapping[str, Making] = {
             position=_xyz("taxels.position"),
             normal=_xyz("taxels.normal"),
         ),
-        Rule(_xyz("resultant_force"), _FORCE, "N", module="resultant"),
+        FieldRule(_xyz("resultant_force"), _FORCE, "N", module="resultant"),
     ),
 }
 PRESETS: Mapping[str, Making] = {

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 _MCAP = b"\x89MCAP"
 
 
-class Wire(Protocol):
+class WireSource(Protocol):
     """A recorded bus: a :class:`skinware.recording.WireTrack`, or one of a log."""
 
     @property
@@ -345,13 +345,13 @@ def _open(path: str, bus: str) -> Recording | LogFile:
         raise ConfigurationError(f"{path}: {error.strerror}") from None
 
 
-def medium_of(recording: Recording | LogFile, wire: Wire) -> str:
+def medium_of(recording: Recording | LogFile, wire: WireSource) -> str:
     """Return ``can``, ``serial`` or ``modbus``: of the recorded driver, else by the recorded items."""
     known = recording.about(wire.driver).get("buses", {}).get(wire.bus, {}).get("medium")
     return str(known or ("serial" if wire.is_serial else "can"))
 
 
-def first_of(wires: Sequence[Wire], start_s: float = 0.0) -> int:
+def first_of(wires: Sequence[WireSource], start_s: float = 0.0) -> int:
     """Return the time of the first item on any of these wires, in the recording's CLOCK_MONOTONIC ns; 0: none.
 
     Args:
@@ -361,13 +361,13 @@ def first_of(wires: Sequence[Wire], start_s: float = 0.0) -> int:
     return min((first.time_ns for first in firsts if first is not None), default=0)
 
 
-def _items(recording: Recording | LogFile, wire: Wire, wanted: ReplayOptions) -> Iterator[WireItem]:
+def _items(recording: Recording | LogFile, wire: WireSource, wanted: ReplayOptions) -> Iterator[WireItem]:
     """Yield the wanted items of a wire, then close the recording."""
     with recording:
         yield from wire.items(start_s=wanted.start, end_s=wanted.end)
 
 
-def wire_of(recording: Recording | LogFile, bus: str = "", driver: str = "") -> Wire:
+def wire_of(recording: Recording | LogFile, bus: str = "", driver: str = "") -> WireSource:
     """Return a recorded wire.
 
     Args:

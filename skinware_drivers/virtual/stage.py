@@ -138,8 +138,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         if self.options.jitter_us:
             ready_ns += int(device.random.integers(0, self.options.jitter_us, endpoint=True)) * 1000
         if ready_ns > time_ns:
-            delay_ns = ready_ns - time_ns
-            late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=delay_ns)
+            late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=ready_ns - time_ns)
             self.log.append(late)
         chances = [getattr(self.options, name) for name in self.frame_faults]
         lost: set[int] = set()
@@ -243,10 +242,8 @@ class Stage(ABC, HasOptions[OptionsT]):
         """Return when ``emit`` is worth calling again; None while all devices are silent."""
         if self.wire.heard:
             return self.wire.heard[0].time_ns
-        event_ns, start_ns = self._event_ns, self.wire.next_start_ns()
-        if event_ns is None or start_ns is None:
-            return start_ns if event_ns is None else event_ns
-        return min(event_ns, start_ns)
+        times_ns = (self._event_ns, self.wire.next_start_ns())
+        return min((time_ns for time_ns in times_ns if time_ns is not None), default=None)
 
     def emit(self, now_ns: int) -> list[WireFrame]:
         """Return the frames that began by ``now_ns`` and were not returned before, oldest first."""
@@ -303,8 +300,7 @@ class Stage(ABC, HasOptions[OptionsT]):
             if kind not in known:
                 listed = ", ".join([*known[:_MOST_LISTED], *(["..."] if len(known) > _MOST_LISTED else [])])
                 raise ConfigurationError(f"option silence: {kind!r} is no kind of frame; there are {listed}")
-        silence_ns = now_ns + round(options.silence_after_s * 1e9)
-        self.schedule(silence_ns, lambda _: self.silent.update(options.silence))
+        self.schedule(now_ns + round(options.silence_after_s * 1e9), lambda _: self.silent.update(options.silence))
         if options.foreign_hz:
             random = np.random.default_rng([options.seed, 2])
             others, queue = self.foreign_identifiers(random), self.wire.attach()

@@ -33,8 +33,8 @@ from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_evidence import Dues, Noise, Use
-from skinware.tactile.health_relations import Copies, Dropouts, Twins
-from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
+from skinware.tactile.health_relations import Copies, Dropouts, Twins, lower_median
+from skinware.tactile.health_report import COLUMNS, Flags, Floats, HealthKind, HealthReport
 from skinware.tactile.neighbours import NONE, Table, neighbours
 from skinware.tactile.rule import resolution_of
 
@@ -53,14 +53,11 @@ _SAME = 0.7
 _SQUARES, _OTHER_SQUARES = 0.0003, 0.03
 """Squared difference in parts of the squares: at most that of shorted neighbours, at least that of others."""
 _EXCHANGED = 0.5
-"""Share of what is due to another dead taxel, from which a dead taxel is at its place."""
+"""Share of what is due to another weak taxel, from which a weak taxel is at its place."""
 _OFTEN = 5.0
 """Times the dropouts of three quarters of the others."""
 _USUAL = 0.1
 """Share of the time: where typical taxels are at an end of the range for longer, that end is where they rest."""
-
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 
 
 class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -199,9 +196,10 @@ class Health:
         self._dropouts.add(self._now_s, self._use.value, given, at_end, calm, far)
         self._use.add(self._now_s, self._now_s - before_s, given, calm)
         hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))
-        self._dues.add(self._now_s, given, calm, hard)
+        above = given - calm.baseline
+        self._dues.add(self._now_s, above, calm, hard)
         self._copies.add(self._now_s, given, calm.usable, self._clear)
-        self._twins.add(self._now_s, given - calm.baseline, calm, self._clear / _CLEAR)
+        self._twins.add(self._now_s, above, calm, self._clear / _CLEAR)
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""
@@ -339,9 +337,7 @@ class Health:
         rows = np.flatnonzero(shares < part * most)
         if len(rows):
             table = self._neighbours[rows]
-            known = np.sort(np.where(table == NONE, math.nan, shares[table]), axis=1)  # NaN comes last
-            count = np.isfinite(known).sum(axis=1)
+            median, count = lower_median(np.where(table == NONE, math.nan, shares[table]))
             enough = count >= _FEWEST_AROUND
-            median = known[np.arange(len(rows)), np.maximum(count - 1, 0) // 2]
             around[rows[enough]] = median[enough]
         return around

@@ -10,12 +10,8 @@ import numpy.typing as npt
 
 from skinware.geometry import Geometry
 from skinware.tactile.baseline import Calm
-from skinware.tactile.health_relations import APART_S, KEPT, Exchanges
+from skinware.tactile.health_relations import APART_S, KEPT, Exchanges, Flags, Floats, Whole
 from skinware.tactile.neighbours import NONE, Table, pitch_m
-
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
-Whole = npt.NDArray[np.int64]
 
 _ENOUGH_FRAMES = 100
 """Frames away from touches that a measurement of noise needs; with fewer it goes on."""
@@ -188,7 +184,7 @@ class Dues:
         hard_touches: (n,) int64, those to which at least half as much was due as to the mean touch.
         recent: (n,) the mean share of the last hard touches, each with the same weight.
         best: (n,) the largest of these means so far; 0 before it is known well.
-        exchanges: dead taxels that show what is due to others.
+        exchanges: weak taxels that show what is due to others.
     """
 
     def __init__(self, geometry: Geometry | None, table: Table) -> None:
@@ -203,12 +199,12 @@ class Dues:
         self._hardest_due, self._hardest_shown = np.zeros(n), np.zeros(n)
         self._compared_s = np.full(n, -math.inf)
 
-    def add(self, now_s: float, given: Floats, calm: Calm, hard: Flags) -> None:
+    def add(self, now_s: float, above: Floats, calm: Calm, hard: Flags) -> None:
         """Take the next frame in.
 
         Args:
             now_s: its time.
-            given: (n,) its values.
+            above: (n,) its values above the baselines.
             calm: what the baseline made of it.
             hard: (n,) taxels that are clearly touched.
         """
@@ -222,7 +218,6 @@ class Dues:
             return
         self._end_touches(np.unique(middle[now_s - self._compared_s[middle] >= APART_S]))
         self._compared_s[middle] = now_s
-        above = given - calm.baseline
         shown, left, right = (np.maximum(above[taxel], 0) for taxel in (middle, one, other))
         due = np.sqrt(left * right)
         harder = np.flatnonzero(calm.usable[middle] & (due > self._hardest_due[middle]))

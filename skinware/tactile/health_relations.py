@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -44,11 +45,18 @@ _MOST_ALONE = 256
 """Taxels that are compared with all others of their modules."""
 
 
-def beside(table: Table, taxels: Whole, flags: Flags) -> Flags:
-    """Return (m,) bool: which of m taxels have a neighbour with a flag."""
+def lower_median(numbers: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], Whole]:
+    """Return (m,) the lower median of the numbers of each row that are not NaN, and (m,) how many these are."""
+    ordered = np.sort(numbers, axis=1)  # NaN comes last
+    count: Whole = (~np.isnan(ordered)).sum(axis=1)
+    return ordered[np.arange(len(numbers)), np.maximum(count - 1, 0) // 2], count
+
+
+def _most_around(table: Table, taxels: Whole, changes: Floats) -> Floats:
+    """Return (m,) the largest change of the neighbours of m taxels."""
     around = table[taxels]
-    found: Flags = (flags[around] & (around != NONE)).any(axis=1)
-    return found
+    most: Floats = np.where(around == NONE, np.float32(0), changes[around]).max(axis=1, initial=0)
+    return most
 
 
 class Dropouts:
@@ -79,15 +87,13 @@ class Dropouts:
             calm: what the baseline made of it.
             far: (n,) a difference from the baseline that is no noise.
         """
-        jump = given - before
+        jump = np.abs(given - before)
         was_still = self._still >= _STILL_FRAMES
-        self._still = np.where(np.abs(jump) <= far, self._still + 1, 0)
-        moved = np.flatnonzero((np.abs(jump) > 2 * far) & calm.usable)
+        self._still = np.where(jump <= far, self._still + 1, 0)
+        moved = np.flatnonzero((jump > 2 * far) & calm.usable)
         if not len(moved):
             return
-        around = self._table[moved]
-        changes = np.where(around == NONE, 0, np.abs(jump[around]))
-        moved = moved[(changes <= _STEADY * np.abs(jump[moved])[:, None]).all(axis=1)]
+        moved = moved[_most_around(self._table, moved, jump) <= _STEADY * jump[moved]]
         back = (now_s - self._lost_s[moved] <= _LOST_S) & (
             np.abs(given[moved] - self._before[moved])
             <= _BACK * np.abs(self._before[moved] - self._lost[moved]) + far[moved]
@@ -95,7 +101,9 @@ class Dropouts:
         self.count[moved[back]] += 1
         self._lost_s[moved[back]] = -math.inf
         rest = calm.baseline[moved]
-        drops = (given[moved] < (rest + before[moved]) / 2) & beside(self._table, moved, calm.touched)
+        around = self._table[moved]
+        is_beside = (calm.touched[around] & (around != NONE)).any(axis=1)  # a touch that they still feel
+        drops = (given[moved] < (rest + before[moved]) / 2) & is_beside
         lost = moved[~back & was_still[moved] & (at_end[moved] | drops | (given[moved] < rest - far[moved]))]
         self._lost_s[lost], self._before[lost], self._lost[lost] = now_s, before[lost], given[lost]
 
@@ -114,8 +122,8 @@ class Exchanges:
         self._due, self._touches = np.zeros((2, 0))
 
     def watch(self, weak: Whole) -> None:
-        """Compare these; pairs that are compared already go on."""
-        taxels = np.union1d(self.taxels[np.isin(self.taxels, weak)], weak)[:_MOST_EXCHANGED].astype(np.int64)
+        """Compare these, in rising order; pairs that are compared already go on."""
+        taxels = weak[:_MOST_EXCHANGED]
         if np.array_equal(taxels, self.taxels):
             return
         then, count = self._rank[taxels], len(taxels)
@@ -194,7 +202,8 @@ class Copies:
         felt = np.flatnonzero(size > clear)[:_MOST_COMPARED]
         if not len(felt):
             return
-        for taxel in felt[self._is_known[felt] & (self._around(felt, size) <= _STEADY * size[felt])].tolist():
+        is_alone = self._is_known[felt] & (_most_around(self._table, felt, size) <= _STEADY * size[felt])
+        for taxel in felt[is_alone].tolist():
             others = felt[(self._module[felt] == self._module[taxel]) & (felt != taxel)]
             if taxel in self._alone or not (size[others] >= _BELOW * size[taxel]).any():
                 continue
@@ -204,15 +213,9 @@ class Copies:
             self._alone[taxel] = _Alone(members[~np.isin(members, [taxel, *self._table[taxel]])])
         modules = set(self._module[felt].tolist())
         watched = np.array([one for one in self._alone if int(self._module[one]) in modules], np.int64)
-        steady = self._around(watched, size) <= np.maximum(_STEADY * size[watched], clear / 2)
+        steady = _most_around(self._table, watched, size) <= np.maximum(_STEADY * size[watched], clear / 2)
         for taxel in watched[steady & usable[watched]].tolist():
             self._alone[taxel].add(now_s, float(change[taxel]), change, clear)
-
-    def _around(self, taxels: Whole, size: Floats) -> Floats:
-        """(m,) the largest change of the neighbours of some taxels."""
-        around = self._table[taxels]
-        largest: Floats = np.where(around == NONE, np.float32(0), size[around]).max(axis=1, initial=0)
-        return largest
 
     def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, npt.NDArray[np.float64]]:
         """Find taxels that show a part of the touches of others.
@@ -318,10 +321,8 @@ class Twins:
             return known[:0], known[:0]
         with np.errstate(invalid="ignore", divide="ignore"):
             part = self._difference[known] / self._size[known]
-        part = np.where(np.isnan(part), math.inf, part)
+        median, _ = lower_median(part)
+        part[np.isnan(part)] = math.inf
         nearest = np.argmin(part, axis=1)
-        ordered = np.sort(part, axis=1)
-        count = np.isfinite(ordered).sum(axis=1)
-        median = ordered[np.arange(len(known)), np.maximum(count - 1, 0) // 2]
-        rows = np.flatnonzero((ordered[:, 0] <= same) & (median >= other))
+        rows = np.flatnonzero((part[np.arange(len(known)), nearest] <= same) & (median >= other))
         return known[rows], self._table[known[rows], nearest[rows]].astype(np.int64)

@@ -12,9 +12,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware import sensor_types
 from skinware.realtime import NS_PER_S
-from skinware.sensor_types import SensorType
+from skinware.sensor_types import CATALOGUE, MAX_NAME_BYTES, SensorType
 from skinware.status import Status
 from skinware.text import printable
 from skinware_drivers.streams.cdr import CdrMessage, Indices, gathered
@@ -22,7 +21,6 @@ from skinware_drivers.streams.cdr import CdrMessage, Indices, gathered
 MOST_VALUES = 4096
 """Values of a part; a field with more becomes several."""
 _MOST_OF_A_MESSAGE = 1 << 16
-_CATALOGUE = {each.name: each for each in vars(sensor_types).values() if isinstance(each, SensorType)}
 _VENDOR = 0x20520 << 12
 """The vendor of quantities that the catalogue lacks; their numbers follow from their names."""
 _PLACEHOLDER = re.compile(r"\{([\w.]+)\}")
@@ -174,10 +172,10 @@ Making = Callable[[CdrMessage, str], Sequence[ModulePart]]
 
 def sensor_type(quantity: str, unit: str) -> SensorType:
     """Return the type of a quantity; one that the catalogue lacks gets a number by its name."""
-    known = _CATALOGUE.get(quantity)
+    known = CATALOGUE.get(quantity)
     if known is not None:
         return known.measured(unit=unit)
-    quantity = _name(quantity).encode()[: sensor_types.MAX_NAME_BYTES].decode(errors="ignore") or "value"
+    quantity = _name(quantity).encode()[:MAX_NAME_BYTES].decode(errors="ignore") or "value"
     return SensorType(quantity, _VENDOR | 1 + zlib.crc32(quantity.encode()) % 0xFFF, unit)
 
 

@@ -117,7 +117,7 @@ class _CheckByte:
         if not self._is_learnt:
             self._seen.append((byte, covered))
             if len(self._seen) == _LEARNT:
-                fitting = [sum(map(_keeps, [rule] * _LEARNT, self._seen)) for rule in _RULES]
+                fitting = [sum(_keeps(rule, packet) for packet in self._seen) for rule in _RULES]
                 self._is_learnt = max(fitting) >= _FITTING
                 self._rule = _RULES[fitting.index(max(fitting))]
                 self._seen.clear()

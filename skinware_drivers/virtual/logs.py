@@ -159,7 +159,8 @@ def _by_python_can(path: str, file: BinaryIO, begin: bytes) -> Iterator[tuple[st
     except (ConfigurationError, GeneratorExit, OSError):
         raise
     except Exception as error:  # noqa: BLE001, readers of python-can raise whatever they meet
-        where = f"line {text.number}" if text.number else f"byte {file.tell()}"
+        at = text.number or file.tell()
+        where = f"{'line' if text.number else 'byte'} {at}"
         what = str(error) or type(error).__name__
         raise ConfigurationError(f"{path}, {where}: damaged ({what}): mend or remove what is there") from None
     finally:
@@ -258,5 +259,6 @@ def _check_link(path: str, link: int) -> None:
 def _taken(path: str, file: BinaryIO, size: int) -> bytes:
     data = file.read(size) if size <= _LARGEST_BLOCK else b""
     if len(data) < size:
-        raise ConfigurationError(f"{path}, byte {file.tell()}: cut off in a packet: all before it was read")
+        at = file.tell()
+        raise ConfigurationError(f"{path}, byte {at}: cut off in a packet: all before it was read")
     return data

@@ -171,6 +171,7 @@ def test_the_past_is_kept_and_saved_when_it_is_wanted(path: Path) -> None:
             assert (np.diff(sequence) == 1).all()
             dropped_ns, newest_ns = skin.times_ns[sequence[0] - 2][0], skin.times_ns[sequence[-1] - 1][1]
             assert newest_ns - dropped_ns > 500_000_000, "all samples of the last 0.6 s are kept"
+            assert opened.duration_s < 1.5
 
 
 @pytest.mark.thorough

@@ -18,6 +18,7 @@ from skinware.driver_service import DriverReader, DriverWriter
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
+from skinware.moments import Moment, Rows, TimeWindow
 from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin
 from skinware.skin_layout import SkinLayout
@@ -35,8 +36,10 @@ __all__ = [
     "DriverReader",
     "DriverSnapshot",
     "DriverWriter",
+    "Moment",
     "Namespace",
     "PatchState",
+    "Rows",
     "Sample",
     "Schema",
     "ServiceReader",
@@ -46,6 +49,7 @@ __all__ = [
     "Snapshot",
     "Status",
     "Structure",
+    "TimeWindow",
     "Window",
     "get_include",
     "realtime",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,7 +80,7 @@ class RecordedWindows(Sequence[Item]):
         if period_s:
             ends |= np.diff(series.time_s) > max(_GAP_PERIODS * period_s, 0.2)
         bounds = [0, *(np.flatnonzero(ends) + 1).tolist(), len(series)]
-        for begin, end in zip(bounds, bounds[1:], strict=False):
+        for begin, end in pairwise(bounds):
             if end - begin >= self._window:
                 self._stretches.append(
                     _Stretch(values[begin:end], fresh[begin:end], series.time_s[begin:end], self._length)

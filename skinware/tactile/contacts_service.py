@@ -118,7 +118,6 @@ class ContactsReader(SourceReader[ContactsSample]):
         for sample in self.in_order(timeout_s=timeout_s):
             yield from events.of(sample.contacts, sample.acquired_ns)
 
-
     def on(self, taxels: Index, *, above: float = 0.0, within_s: float = 0.0) -> Contact | None:
         """Return the newest contact on some taxels at once; None without any.
 

@@ -101,7 +101,9 @@ def test_robots_of_two_labs_meet(namespace: Namespace) -> None:
             until_told(listed, "walle")
             route.wait_for("status", lambda event: event["robots"] == {"walle": 1})
             with DriverReader("arm", namespace=here, timeout_s=PATIENCE_S) as arm:
-                wait_until(lambda: arm.newest_position is not None and bool(arm.read().fresh("pressure").all()), PATIENCE_S)
+                wait_until(
+                    lambda: arm.newest_position is not None and bool(arm.read().fresh("pressure").all()), PATIENCE_S
+                )
             with ServiceReader("pump", namespace=here, timeout_s=PATIENCE_S) as service:
                 assert service.call("tare", timeout_s=PATIENCE_S) == "tared"
 

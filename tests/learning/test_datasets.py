@@ -80,9 +80,10 @@ def test_tensors_share_the_memory_of_arrays(tmp_path: Path) -> None:
         import torch
         import torch.utils.data
     except ImportError:
-        for make, of in ((torch_dataset, windows), (torch_iterable, stream)):
-            with pytest.raises(MissingExtra, match="pip install torch"):
-                make(of)  # type: ignore[operator]
+        with pytest.raises(MissingExtra, match="pip install torch"):
+            torch_dataset(windows)
+        with pytest.raises(MissingExtra, match="pip install torch"):
+            torch_iterable(stream)
         return
     dataset = torch_dataset(windows)
     assert isinstance(dataset, torch.utils.data.Dataset)

@@ -18,7 +18,7 @@ from skinware.driver_service import DriverReader, DriverWriter
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
-from skinware.moments import Moment, Rows, TimeWindow
+from skinware.moments import SkinMoment, TimedRows, TimeWindow
 from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin
 from skinware.skin_layout import SkinLayout
@@ -36,20 +36,20 @@ __all__ = [
     "DriverReader",
     "DriverSnapshot",
     "DriverWriter",
-    "Moment",
     "Namespace",
     "PatchState",
-    "Rows",
     "Sample",
     "Schema",
     "ServiceReader",
     "ServiceWriter",
     "Skin",
     "SkinLayout",
+    "SkinMoment",
     "Snapshot",
     "Status",
     "Structure",
     "TimeWindow",
+    "TimedRows",
     "Window",
     "get_include",
     "realtime",

@@ -21,7 +21,7 @@ _SPARE = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class SkinMoment:
     """The skin at one moment: the samples of each driver around it.
 
     A sensor's data has a time of its own (``Snapshot.time_ns``), and values are interpolated between these times.
@@ -97,7 +97,7 @@ class Moment:
         return np.where(after > before, np.clip((self.time_ns - before) / span, 0.0, 1.0), 0.0)
 
 
-class Rows(NamedTuple):
+class TimedRows(NamedTuple):
     """Values on one time base.
 
     Attributes:
@@ -171,7 +171,7 @@ class TimeWindow:
             while len(kept) > 1 and kept[0].acquired_ns < oldest_ns:
                 kept.popleft()
 
-    def rows(self, end_ns: int | None = None) -> Rows:
+    def rows(self, end_ns: int | None = None) -> TimedRows:
         """Return the rows of the window: of each driver the sample nearest in time.
 
         Args:
@@ -187,7 +187,7 @@ class TimeWindow:
         times_ns = last_ns - np.rint(np.arange(self.length - 1, -1, -1) * self._step_ns).astype(np.int64)
         parts = [self._part(number, times_ns) for number in range(len(self._kept))]
         physical, mask, off_s = (np.concatenate([part[of] for part in parts], axis=1) for of in range(3))
-        return Rows(times_ns, physical, mask, off_s)
+        return TimedRows(times_ns, physical, mask, off_s)
 
     def _reached_ns(self) -> int:
         newest_ns = [kept[-1].acquired_ns for kept in self._kept]

@@ -15,7 +15,7 @@ from skinware.geometry import Geometry
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring_reader import NEWER, NEWEST, Take
-from skinware.moments import Moment
+from skinware.moments import SkinMoment
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._reader import Tap
 from skinware.skin_layout import SkinLayout
@@ -179,11 +179,11 @@ class Skin:
         except ServiceTimeout:
             return None
 
-    def at(self, time_ns: int, *, timeout_s: float = 0.0) -> Moment:
+    def at(self, time_ns: int, *, timeout_s: float = 0.0) -> SkinMoment:
         """Return the skin at a moment of the last second or so, such as the one of a camera's image.
 
         Each driver's ring holds as many samples as it has slots; an older moment is answered with the oldest, and
-        ``Moment.off_s`` says how far it is away.
+        ``SkinMoment.off_s`` says how far it is away.
 
         Args:
             time_ns: the moment, CLOCK_MONOTONIC ns.
@@ -207,7 +207,7 @@ class Skin:
             except Overrun:
                 continue
             before, after = (Snapshot(self._layout, tuple(samples)) for samples in zip(*pairs, strict=True))
-            return Moment(time_ns, before, after)
+            return SkinMoment(time_ns, before, after)
 
     def _look_in_c(self, known: Snapshot | None, deadline_ns: int) -> tuple[bool, Snapshot | None]:
         """Return whether C waited for anything newer, and the snapshot if there is one."""

@@ -148,7 +148,7 @@ def torch_dataset(windows: Sequence[Item]) -> Any:
     """
     torch = _torch()
 
-    class Windows:
+    class OfWindows:
         def __len__(self) -> int:
             return len(windows)
 
@@ -158,7 +158,7 @@ def torch_dataset(windows: Sequence[Item]) -> Any:
         def __reduce__(self) -> tuple[Any, ...]:  # for workers that are not forked
             return torch_dataset, (windows,)
 
-    return type("TorchWindows", (Windows, torch.utils.data.Dataset), {})()
+    return type("TorchWindows", (OfWindows, torch.utils.data.Dataset), {})()
 
 
 def torch_iterable(samples: StreamedSamples) -> Any:
@@ -169,7 +169,7 @@ def torch_iterable(samples: StreamedSamples) -> Any:
     """
     torch = _torch()
 
-    class Stream:
+    class OfStream:
         def __iter__(self) -> Iterator[dict[str, Any]]:
             worker = torch.utils.data.get_worker_info()
             share = (0, 1) if worker is None else (worker.id, worker.num_workers)
@@ -178,7 +178,7 @@ def torch_iterable(samples: StreamedSamples) -> Any:
         def __reduce__(self) -> tuple[Any, ...]:
             return torch_iterable, (samples,)
 
-    return type("TorchStream", (Stream, torch.utils.data.IterableDataset), {})()
+    return type("TorchStream", (OfStream, torch.utils.data.IterableDataset), {})()
 
 
 def _tensors(torch: Any, item: Item) -> dict[str, Any]:

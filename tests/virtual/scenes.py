@@ -86,3 +86,10 @@ def expected_counts(
             }
         )
     return found
+
+
+def course_of(scene: Scene, until_s: float, every_s: float = 0.02) -> Any:
+    """Step a scene by its own moves; yield (time_s, normal force on each module, N, contacts of modules)."""
+    while scene.time_s < until_s - every_s / 2:
+        scene.step_to(scene.time_s + every_s)
+        yield scene.time_s, [float(forces[:, 2].sum()) for forces in scene.newtons()], scene.touching()

@@ -108,7 +108,7 @@ def test_the_centre_of_pressure_is_that_of_the_contact(tmp_path: Path, seed: int
 
 def test_a_contact_between_taxels_is_shared_by_the_nearest(tmp_path: Path) -> None:
     [module] = pad(tmp_path).modules
-    touch = Touching(0, np.array([0.0, 0.0, 0.0]), 2.0, np.array([0.5, 0.0, 0.0]), 0.0)
+    touch = Touching(0, np.zeros(3), np.array([0.0, 0.0, 1.0]), 2.0, np.array([0.5, 0.0, 0.0]), 0.0)
     forces = spread(module, np.zeros(16), [touch])
     assert np.count_nonzero(forces[:, 2]) == 4
     assert forces.sum(axis=0) == pytest.approx([0.5, 0.0, 2.0])
@@ -229,7 +229,7 @@ def test_a_world_that_is_not_there_is_refused(world: str, says: str) -> None:
         ("rows = 4\ncolumns = 40", "", "is not above the body"),
         ("rows = 4\ncolumns = 5", "", "has 48 values, not 60"),
         ("rows = 4\ncolumns = 4\ndevice = 9", "", "there is no device 9; there are 1"),
-        ("columns = 4", "", "either rows or a geometry"),
+        ("columns = 4", "", "either rows, a geometry or an arm_board"),
         ('rows = 4\naxes = "xq"', "", "axes"),
         ("rows = 4\ntransfer = {nois = 1}", "", "nois"),
         ('geometry = "nowhere.toml"', "", "nowhere.toml"),

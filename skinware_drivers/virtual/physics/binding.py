@@ -31,7 +31,7 @@
     seconds = 0.5
 
 Instead of a grid, a module may name a ``geometry`` file, whose frame is that of the body, and the first and last
-``uid`` of its sensors there.
+``uid`` of its sensors there; or ``arm_board``, one of the boards of :func:`skinware.tactile.testing.arm`.
 """
 
 from __future__ import annotations
@@ -67,13 +67,14 @@ class ModuleBinding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     at_m: Triple = (0.0, 0.0, 0.0)
     x: Triple = (1.0, 0.0, 0.0)
     y: Triple = (0.0, 1.0, 0.0)
+    arm_board: int | None = None
     geometry: str = ""
     uid: tuple[int, int] = (0, (1 << 64) - 1)
     transfer: dict[str, Any] = {}
 
     def __post_init__(self) -> None:
-        if (self.rows is None) == (not self.geometry):
-            raise ValueError(f"module on {self.body}: give either rows or a geometry")
+        if (self.rows is not None) + bool(self.geometry) + (self.arm_board is not None) != 1:
+            raise ValueError(f"module on {self.body}: give either rows, a geometry or an arm_board")
 
 
 class Move(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

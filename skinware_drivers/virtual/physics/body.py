@@ -19,6 +19,8 @@ _LONGEST_CATCH_UP_S = 1.0
 """Time of the scene that is made up for; more is left out."""
 _NEAREST = 4
 """Taxels that share the force of a contact which none of them reaches into."""
+_SAME_WAY = 0.5
+"""Cosine of the largest angle between a contact's normal and that of a taxel which feels it."""
 _EPSILON = 1e-9
 
 
@@ -28,6 +30,7 @@ class Touching(NamedTuple):
     Attributes:
         module: number of the module.
         point_m: (3,) in the frame of its body, m.
+        normal: (3,) outwards, in the same frame.
         normal_n: N.
         shear_n: (3,) in the same frame, on the module, N.
         slip_m_s: speed of the other body along the surface, m/s.
@@ -35,6 +38,7 @@ class Touching(NamedTuple):
 
     module: int
     point_m: ArrayF
+    normal: ArrayF
     normal_n: float
     shear_n: ArrayF
     slip_m_s: float
@@ -156,11 +160,12 @@ class Scene:
         body = int(self.model.geom_bodyid[geom])
         rotation = self.data.xmat[body].reshape(3, 3)
         point = rotation.T @ (contact.pos - self.data.xpos[body])
-        reach = [np.linalg.norm(self.modules[m].position_m - point, axis=1).min() for m in self._module_of[geom]]
+        frame = contact.frame.reshape(3, 3)
+        outward = rotation.T @ (-sign * frame[0])
+        reach = [distances(self.modules[m], point, outward).min() for m in self._module_of[geom]]
         module = self._module_of[geom][int(np.argmin(reach))]
         if min(reach) > self.modules[module].reach_m:
             return None
-        frame = contact.frame.reshape(3, 3)
         shear = sign * (frame[1:].T @ force[1:3])
         speeds = []
         for other in (geom, int(contact.geom[1 - side])):
@@ -168,7 +173,7 @@ class Scene:
             mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_GEOM, other, six, 0)
             speeds.append(six[3:] + np.cross(six[:3], contact.pos - self.data.geom_xpos[other]))
         slip = frame[1:] @ (speeds[1] - speeds[0])
-        return Touching(module, point, float(force[0]), rotation.T @ shear, float(np.linalg.norm(slip)))
+        return Touching(module, point, outward, float(force[0]), rotation.T @ shear, float(np.linalg.norm(slip)))
 
     def _obey_moves(self) -> None:
         moves, repeat_s = self._bound.binding.move, self._bound.binding.repeat_s
@@ -183,9 +188,10 @@ class Scene:
                 self._round += 1
 
     def _names(self, kind: Any, count: int) -> list[str]:
-        return [str(mujoco.mj_id2name(self.model, kind, number) or number) for number in range(count)]
+        names = [mujoco.mj_id2name(self.model, kind, number) for number in range(count)]
+        return [str(number) if name is None else name for number, name in enumerate(names)]
 
-    def _check(self, targets: Mapping[str, float], where: str) -> None:
+    def _check(self, targets: Mapping[str, Any], where: str) -> None:
         for name, target in targets.items():
             if name not in self.actuators:
                 raise ConfigurationError(
@@ -193,6 +199,13 @@ class Scene:
                 )
             if isinstance(target, bool) or not isinstance(target, int | float) or not np.isfinite(target):
                 raise ConfigurationError(f"{where}: {name}={target!r} is no number")
+
+
+def distances(taxels: Taxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:
+    """Return (n,) distances of taxels from a contact, m; infinite for those that face another way."""
+    distance: ArrayF = np.linalg.norm(taxels.position_m - point_m, axis=1)
+    distance[taxels.axes[:, 2] @ normal < _SAME_WAY + _EPSILON] = np.inf
+    return distance
 
 
 def spread(taxels: Taxels, depth_m: ArrayF, touches: Sequence[Touching]) -> ArrayF:
@@ -205,11 +218,10 @@ def spread(taxels: Taxels, depth_m: ArrayF, touches: Sequence[Touching]) -> Arra
         depth_m: (n,) by which the other bodies reach beyond each taxel.
     """
     force_n = np.zeros((len(depth_m), 3))
-    points = np.array([touch.point_m for touch in touches])
-    distance = np.linalg.norm(taxels.position_m[:, np.newaxis] - points, axis=2)
+    distance = np.stack([distances(taxels, touch.point_m, touch.normal) for touch in touches], axis=1)
     nearest = distance.argmin(axis=1)
     for number, touch in enumerate(touches):
-        rows = np.flatnonzero((nearest == number) & (depth_m > 0))
+        rows = np.flatnonzero((nearest == number) & (depth_m > 0) & np.isfinite(distance[:, number]))
         weight = depth_m[rows]
         if not len(rows):
             rows = np.argsort(distance[:, number])[:_NEAREST]

@@ -15,13 +15,17 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, read_geometry
+from skinware.tactile.testing import arm
 from skinware_drivers.virtual.physics.binding import Bound, ModuleBinding
 
 ArrayF = npt.NDArray[np.float64]
 
 _FEWEST_VERTICES = 4
 _FAR_M = 1e3
-"""Where vertices are that a mesh must have besides its taxels."""
+"""Where vertices are that feel nothing."""
+_CHANNELS = 12
+_FELT = (0, 1, 2, 3, 4, 5, 7, 8, 9, 11)
+"""Channels of a triangle that feel pressure."""
 _CLOSEST_M = 0.1
 """Height above a grid from which it is projected onto the body."""
 _LONE_REACH_M = 0.005
@@ -82,6 +86,10 @@ def place(model: Any, module: ModuleBinding, bound: Bound) -> Taxels:
         rows = np.flatnonzero((geometry.uid >= first) & (geometry.uid <= last) & np.isfinite(geometry.position_m[:, 0]))
         rows = rows[np.argsort(geometry.uid[rows])]
         position_m, normal = geometry.position_m[rows], np.nan_to_num(geometry.normal[rows], nan=0.0)
+    elif module.arm_board is not None:
+        surface = arm([module.arm_board], pads=True)
+        position_m, normal = surface.position_m.copy(), surface.normal
+        position_m[~np.isin(np.arange(len(position_m)) % _CHANNELS, _FELT)] = _FAR_M  # pads, which feel warmth
     else:
         position_m, normal = _projected(model, geoms, module, f"{bound.file}: module {name!r}")
     if not len(position_m):

@@ -59,8 +59,7 @@ class World:
         self._ends = next_value
         self._file = bound.file
         self._services = WorldServices(self.scene) if has_services else None
-        if self._services is not None:
-            weakref.finalize(self, self._services.close)
+        self._at_end = None if self._services is None else weakref.finalize(self, self._services.close)
 
     def fit(self, numbers: Sequence[int], n_values: int) -> None:
         """Check that a binding fits the devices of an emulator.
@@ -116,6 +115,6 @@ class World:
 
     def close(self) -> None:
         """Take the services away. Idempotent."""
-        if self._services is not None:
-            self._services.close()
-            self._services = None
+        self._services = None
+        if self._at_end is not None:
+            self._at_end()

@@ -35,13 +35,11 @@ def world(tmp_path: Path, namespace: Namespace) -> Iterator[World]:
 
 
 def run(world: World, duration_ms: int) -> None:
-    """Let the world run; its time ends now, so that readers find its samples new."""
-    end_ns = now_ns()
-    if world.origin_ns is not None:
-        world.origin_ns = end_ns - round(world.scene.time_s * 1e9) - duration_ms * MS
-    for step in range(0, duration_ms, 10):
-        world.advance(end_ns - (duration_ms - step) * MS)
-    world.advance(end_ns)
+    """Let the world run; its time begins 20 s ago, so that none of its samples is of the future."""
+    begun_ns = world.origin_ns or now_ns() - 20_000 * MS
+    at_ns = begun_ns + round(world.scene.time_s * 1e9)
+    for step in range(0, duration_ms + 1, 10):
+        world.advance(at_ns + step * MS)
 
 
 def newest(name: str) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -58,8 +58,9 @@ class World:
             self._of_device.setdefault(device, []).append((number, first))
         self._ends = next_value
         self._file = bound.file
-        self._services = WorldServices(self.scene) if has_services else None
-        self._at_end = None if self._services is None else weakref.finalize(self, self._services.close)
+        self._has_services = has_services
+        self._services: WorldServices | None = None
+        self._at_end: Callable[[], object] | None = None
 
     def fit(self, numbers: Sequence[int], n_values: int) -> None:
         """Check that a binding fits the devices of an emulator.
@@ -78,6 +79,9 @@ class World:
         """Let the physics run to a time of the devices; the first call is at 0 s of the scene."""
         if self.origin_ns is None:
             self.origin_ns = time_ns
+            if self._has_services:
+                self._services = WorldServices(self.scene)
+                self._at_end = weakref.finalize(self, self._services.close)
         late_s = self.since_s(time_ns) - self.scene.time_s - _LONGEST_CATCH_UP_S * self._speed
         if late_s > 0:
             self.origin_ns += round(late_s / self._speed * NS_PER_S)

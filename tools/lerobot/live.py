@@ -16,7 +16,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import skinware
 import skinware.recording
-from skinware.learning.images import Colours, TouchImage
+from skinware.learning.images import Colours, TouchImage, range_of
 from skinware.learning.live import Totals
 
 BIN = Path(sys.executable).parent
@@ -104,12 +104,12 @@ def check_rows(folder: Path, name: str, busy: int) -> None:
     positions = np.arange(len(layout.module_of("pressure")))
     totals = Totals(layout, "pressure", positions, "taxel")
     columns = [names.index(f"touch.{each}") for each in totals.names]
-    values = series.physical("pressure")
+    values = np.where(series.status_of("pressure") == 0, series.physical("pressure"), 0)
     times_ns = np.loadtxt(f"{folder / name}.times", np.int64)
     assert len(times_ns) == len(state) == dataset.meta.total_frames, (len(times_ns), len(state))
     acquired_ns = series.acquired_ns
     period_ns = series.origin.period_ns
-    image = TouchImage(layout, "pressure", positions, 48, 96, Colours("grey", 0, 4095))
+    image = TouchImage(layout, "pressure", positions, 48, 96, Colours("grey", *range_of(layout, "pressure")))
     ties, offs = 0, []
     for row, time_ns in enumerate(times_ns.tolist()):
         distance = np.abs(acquired_ns - time_ns)

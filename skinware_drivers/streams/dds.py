@@ -8,10 +8,9 @@ in 10 us u32; the sample with its encapsulation; CRC-32 of everything before it.
 from __future__ import annotations
 
 import logging
-import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -21,6 +20,7 @@ from msgspec import Meta
 from skinware.errors import ConfigurationError
 from skinware.realtime import now_ns
 from skinware.ros2.transport import HIGHEST_DOMAIN
+from skinware.ros_types import Definitions, dds_name, ros_name
 from skinware_drivers.bus import Bus
 from skinware_drivers.fields import DeviceTime
 from skinware_drivers.options import OptionsT
@@ -43,7 +43,6 @@ LONGEST = 1 << 20
 """Bytes of the longest sample that is read."""
 _SYNC = b"\xdd\x5a"
 _HEAD = struct.Struct("<2sIHI")
-_ROS_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 _STAMP_NS = 10_000
 SOURCE_TIME = DeviceTime(0, "<u4", _STAMP_NS / 1e9)
 """The time at which the publisher wrote a sample, in the body of its record."""
@@ -55,24 +54,19 @@ class DdsTopic:
 
     Attributes:
         name: in DDS, which ROS 2 begins with ``rt/``.
-        type_name: as in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``;
-            or with one slash, for types that are not of ROS.
-        texts: definitions as in ``.msg`` files, by type without ``msg``. Publishers whose type is another are not read;
-            a topic can be declared once for each edition of its type, and for each of several types: those are asked
-            for once one of them is published.
+        definitions: of its type. Publishers whose type is another are not read; a topic can be declared once for each
+            edition of its type, and for each of several types: those are asked for once one of them is published.
         number: identifier of its samples, 0 to 65535.
     """
 
     name: str
-    type_name: str
-    texts: Mapping[str, str] = field(hash=False)
+    definitions: Definitions
     number: int = 0
 
     @property
     def dds_type(self) -> str:
         """The name of its type in DDS."""
-        *package, plain = self.type_name.split("/")
-        return f"{'::'.join(package)}::dds_::{plain}_" if len(package) > 1 else f"{package[0]}::{plain}"
+        return dds_name(self.definitions.type_name)
 
 
 @dataclass(frozen=True)
@@ -92,10 +86,8 @@ class HeardTopic:
 
     @property
     def ros_type(self) -> str:
-        """Its type as a :class:`DdsTopic` names it; empty if it is no type of a message."""
-        if match := _ROS_TYPE.fullmatch(self.type_name):
-            return f"{match[1]}/msg/{match[2]}"
-        return self.type_name.replace("::", "/") if re.fullmatch(r"\w+::\w+", self.type_name) else ""
+        """Its type in ROS; empty if it is no type of a message."""
+        return ros_name(self.type_name)
 
 
 def samples(longest: int) -> Packet:

@@ -364,6 +364,6 @@ def _qos(options: DdsOptions, *policies: Any) -> Qos:
 
 def _topic(participant: DomainParticipant, topic: DdsTopic) -> Any:
     """Return a topic whose samples stay bytes."""
-    made = struct_type(topic.type_name, topic.texts)
+    made = struct_type(topic.definitions)
     made.deserialize = made.deserialize_key = _Bytes
     return Topic(participant, topic.name, made)

@@ -23,6 +23,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
+from skinware.ros_types import Definitions
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
@@ -55,7 +56,8 @@ _TEXTS = {
         "uint32[2] error\nuint32[2] reserve\n"
     ),
 }
-_EDITIONS = (_TEXTS, _TEXTS | {"unitree_hg/PressSensorState": "float32[12] pressure\nfloat32[12] temperature\n"})
+_OLD_PAD = {"unitree_hg/PressSensorState": "float32[12] pressure\nfloat32[12] temperature\n"}
+_EDITIONS = Definitions(_STATE, _TEXTS), Definitions(_STATE, _TEXTS | _OLD_PAD)
 _BEGINNINGS = {"full": "rt/dex3", "low": "rt/lf/dex3"}
 
 _MOTORS, _TAXELS, _MOST_PADS = 7, 12, 16
@@ -79,9 +81,7 @@ _MOST_TOLD = 16
 
 def _topics(beginning: str, sides: Sequence[str]) -> list[DdsTopic]:
     return [
-        DdsTopic(f"{beginning}/{side}/state", _STATE, texts, _SIDES.index(side))
-        for side in sides
-        for texts in _EDITIONS
+        DdsTopic(f"{beginning}/{side}/state", edition, _SIDES.index(side)) for side in sides for edition in _EDITIONS
     ]
 
 

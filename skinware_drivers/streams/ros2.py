@@ -21,6 +21,7 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
+from skinware.ros_types import Definitions
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
@@ -32,7 +33,7 @@ from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.stream import Split
-from skinware_drivers.streams.cdr import CdrMessage, Definitions
+from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.dds import LONGEST, SOURCE_TIME, DdsAdapter, DdsTopic, TopicBus, samples
 from skinware_drivers.streams.ros2_map import guessed, preset, read_map, texts_of
 from skinware_drivers.streams.ros2_parts import MOST_VALUES, Making, ModulePart, Plan
@@ -155,7 +156,7 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
             if heard and known is None:
                 known = texts_of(heard[0], definitions)
                 self.change_framing(Split(samples(LONGEST), keep))
-                self._line.read_only(DdsTopic(name, heard[0], known.texts, _TYPES - 1))
+                self._line.read_only(DdsTopic(name, known, _TYPES - 1))
             if kept and known is not None:
                 text = guessed(_in_ros(name), heard[0], CdrMessage(kept[0], known), known)
                 await asyncio.to_thread(Path(file).write_text, text, encoding="utf-8")
@@ -308,7 +309,7 @@ def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Definitions, Making]]:
     if options.map:
         for ordinal, (mapped, definitions, making) in enumerate(read_map(options.map)):
             number = ordinal * _TYPES + _TYPES - 1
-            topic = DdsTopic(_in_dds(mapped.name), mapped.type, definitions.texts, number)
+            topic = DdsTopic(_in_dds(mapped.name), definitions, number)
             found.append((topic, definitions, making))
     else:
         for ordinal, text in enumerate(options.topic):
@@ -316,7 +317,7 @@ def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Definitions, Making]]:
             for number, (known, making) in enumerate(PRESETS.items()):
                 if not type_name or known == type_name:
                     definitions = Definitions(known, TEXTS)
-                    topic = DdsTopic(_in_dds(name), known, definitions.texts, ordinal * _TYPES + number)
+                    topic = DdsTopic(_in_dds(name), definitions, ordinal * _TYPES + number)
                     found.append((topic, definitions, making))
             if type_name:
                 preset(type_name)

@@ -33,9 +33,10 @@ from pathlib import Path
 import msgspec
 
 from skinware.errors import ConfigurationError
+from skinware.ros_types import Definitions
 from skinware.text import nearest_name
 from skinware.toml_text import TomlText
-from skinware_drivers.streams.cdr import CdrMessage, Definitions
+from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.ros2_parts import FieldRule, Making, by_rules
 from skinware_drivers.streams.ros2_presets import PRESETS, TEXTS
 

@@ -44,6 +44,7 @@ LONGEST = 1 << 20
 _SYNC = b"\xdd\x5a"
 _HEAD = struct.Struct("<2sIHI")
 _STAMP_NS = 10_000
+_MOST_TROUBLES = 16
 SOURCE_TIME = DeviceTime(0, "<u4", _STAMP_NS / 1e9)
 """The time at which the publisher wrote a sample, in the body of its record."""
 
@@ -142,10 +143,10 @@ class TopicBus(ServerBus):
     """A bus of topics.
 
     Attributes:
-        topics: to read; :class:`DdsAdapter` sets them.
+        topics: to read; :class:`DdsAdapter` sets them. None: not set.
     """
 
-    topics: Sequence[DdsTopic] = ()
+    topics: Sequence[DdsTopic] | None = None
 
     def heard(self) -> list[HeardTopic]:
         """Return the topics that are published there, as far as that is known."""
@@ -200,7 +201,7 @@ class DdsBus(TopicBus):
     def _open_port(self) -> Port:
         from skinware_drivers.streams.dds_ends import DdsPort
 
-        if not self.topics:
+        if self.topics is None:
             raise ConfigurationError(f"{self.name}: this driver reads no topics")
         self._joined = DdsPort(self.name, self.domain, self._options, self.topics)
         return self._joined
@@ -237,10 +238,21 @@ class DdsAdapter(SerialAdapter[OptionsT]):
     Attributes:
         topics: that it reads, with numbers by which its layout knows them.
         reads_any_name: it reads topics of these types under any name.
+        troubles: with samples that were logged so far.
     """
 
     topics: Sequence[DdsTopic] = ()
     reads_any_name: ClassVar[bool] = False
+
+    def __init__(self, options: OptionsT) -> None:
+        super().__init__(options)
+        self.troubles: list[str] = []
+
+    def log_once(self, text: str) -> None:
+        """Log a trouble with samples; each once, and a few at most."""
+        if text not in self.troubles and len(self.troubles) < _MOST_TROUBLES:
+            self.troubles.append(text)
+            log.warning("%s", text)
 
     def fit(self, bus: Bus) -> None:
         """Give the bus framing and topics.

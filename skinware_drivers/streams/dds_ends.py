@@ -5,11 +5,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import time
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, InstanceState
@@ -38,11 +37,10 @@ from skinware_drivers.streams.dds import (
 
 _AT_ONCE = 16
 """Samples of a topic in one read."""
-_MOST_PUBLISHERS = 256
 _SILENT_NS = 2 * NS_PER_S
 _UNREAD_NS = 5 * NS_PER_S
 """Time after which a publisher that no reader has matched is reported."""
-_MOST_LISTED = 4096
+_MOST_PUBLISHERS = 4096
 _ALL_BITS = (1 << 64) - 1
 """Handles of matched publishers have a sign, those of samples have none."""
 
@@ -56,12 +54,11 @@ class _Bytes(bytes):
     sample_info: Any
 
 
-@dataclass
-class _Publisher:
+class _Publisher(NamedTuple):
+    handle: int
     topic: str
     type_name: str
     came_ns: int
-    is_judged: bool = False
 
 
 @dataclass
@@ -88,9 +85,9 @@ class DdsPort(Port):
 
     def __init__(self, name: str, domain: int, options: DdsOptions, topics: Sequence[DdsTopic]) -> None:
         self._name, self._topics, self._options = name, topics, options
-        self._heard: dict[int, tuple[str, str]] = {}
-        self._sources: dict[str, _HeardPublisher] = {}
         self._publishers: dict[int, _Publisher] = {}
+        self._unjudged: deque[_Publisher] = deque()
+        self._sources: dict[str, _HeardPublisher] = {}
         self._news: list[News] = []
         self._refused = self._rejected = self._rejected_before = 0
         self._domain, self._participant = _joined(name, domain, options)
@@ -113,13 +110,18 @@ class DdsPort(Port):
         with _as_bus_error(self._name):
             for number in tuple(self._readers):
                 self._waiting.forget(self._readers.pop(number))
+            published = {(one.topic, one.type_name) for one in self._publishers.values()}
             for number, topic in enumerate(topics):
-                if len(set(self._types_of(topic.name))) == 1 or (topic.name, topic.dds_type) in self._heard.values():
+                if len(set(self._types_of(topic.name))) == 1 or (topic.name, topic.dds_type) in published:
                     self._subscribe(number)
 
     def heard(self) -> list[HeardTopic]:
         """Return the topics that are published."""
-        return _counted(self._heard.values())
+        with _as_bus_error(self._name):
+            while self._look(now_ns()):
+                pass
+        counts = Counter((one.topic, one.type_name) for one in self._publishers.values())
+        return [HeardTopic(topic, kind, count) for (topic, kind), count in sorted(counts.items())]
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
         """Return records of samples that have come, at most a few of each topic.
@@ -155,15 +157,13 @@ class DdsPort(Port):
 
     def take_news(self, time_ns: int) -> list[News]:
         """Return the news of publishers since the last call; those that came a while ago must have been matched."""
-        matched: set[int] | None = None
-        for publisher, one in self._publishers.items():
-            if one.is_judged or time_ns - one.came_ns < _UNREAD_NS:
-                continue
-            one.is_judged = True
+        while self._unjudged and time_ns - self._unjudged[0].came_ns >= _UNREAD_NS:
+            one = self._unjudged.popleft()
             with _as_bus_error(self._name):
                 readers = self._readers.values()
                 matched = {each & _ALL_BITS for reader in readers for each in reader.get_matched_publications()}
-            if publisher not in matched and one.type_name in self._types_of(one.topic):
+            is_there = self._publishers.get(one.handle) is one
+            if is_there and one.handle not in matched and one.type_name in self._types_of(one.topic):
                 self._tell(
                     f"a publisher of {one.topic} cannot be read: its type {one.type_name} has another structure, or it"
                     " does not offer the qos that is asked for",
@@ -178,28 +178,26 @@ class DdsPort(Port):
     def _tell(self, text: str, level: int = logging.INFO) -> None:
         self._news.append((level, text))
 
-    def _look(self, time_ns: int) -> None:
-        """Note which publishers of the topics came or went."""
-        for one in self._publications.take(_AT_ONCE):
-            publisher = one.sample_info.instance_handle
+    def _look(self, time_ns: int) -> bool:
+        """Note which publishers came or went; return whether any did."""
+        found = self._publications.take(_AT_ONCE)
+        for one in found:
+            handle = one.sample_info.instance_handle
             if one.sample_info.valid_data and one.sample_info.instance_state == InstanceState.Alive:
-                if len(self._heard) < _MOST_LISTED:
-                    self._heard[publisher] = one.topic_name, one.type_name
-                if publisher not in self._publishers and self._types_of(one.topic_name):
-                    self._welcome(publisher, _Publisher(one.topic_name, one.type_name, time_ns))
-                continue
-            self._heard.pop(publisher, None)
-            if (gone := self._publishers.pop(publisher, None)) is not None:
+                if handle not in self._publishers and len(self._publishers) < _MOST_PUBLISHERS:
+                    publisher = _Publisher(handle, one.topic_name, one.type_name, time_ns)
+                    self._publishers[handle] = publisher
+                    if types := self._types_of(one.topic_name):
+                        self._welcome(publisher, types)
+            elif (gone := self._publishers.pop(handle, None)) is not None and self._types_of(gone.topic):
                 self._tell(f"a publisher of {gone.topic} is gone")
                 source = self._sources.get(gone.topic)
-                if source is not None and source.publisher == publisher:
+                if source is not None and source.publisher == handle:
                     del self._sources[gone.topic]
+        return bool(found)
 
-    def _welcome(self, publisher: int, one: _Publisher) -> None:
-        if len(self._publishers) >= _MOST_PUBLISHERS:
-            return
-        self._publishers[publisher] = one
-        types = self._types_of(one.topic)
+    def _welcome(self, one: _Publisher, types: Sequence[str]) -> None:
+        self._unjudged.append(one)
         for number, topic in enumerate(self._topics):
             if (topic.name, topic.dds_type) == (one.topic, one.type_name) and number not in self._readers:
                 self._subscribe(number)
@@ -313,32 +311,6 @@ class _PublishingPort(Port):
             self._domain = None
             os.close(self._event)
             self._event = -1
-
-
-def heard_topics(channel: str, options: dict[str, str], duration_s: float) -> list[HeardTopic]:
-    """Join a domain for a while, and return the topics that are published there; nothing is asked or published.
-
-    Raises:
-        BusNotAvailable: the domain cannot be joined.
-        ConfigurationError: no such domain, or an option is unknown or has a bad value.
-    """
-    name = f"bus dds://{channel}"
-    domain, participant = _joined(name, parse_domain(channel), options_from_strings(DdsOptions, options))
-    with _as_bus_error(name):
-        publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-        time.sleep(duration_s)
-        found = _counted(
-            (one.topic_name, one.type_name)
-            for one in publications.read(_MOST_LISTED)
-            if one.sample_info.valid_data and one.sample_info.instance_state == InstanceState.Alive
-        )
-    del publications, participant, domain
-    return found
-
-
-def _counted(published: Iterable[tuple[str, str]]) -> list[HeardTopic]:
-    """Return topics and types of publishers, each once with the number of its publishers."""
-    return [HeardTopic(topic, kind, count) for (topic, kind), count in sorted(Counter(published).items())]
 
 
 @contextlib.contextmanager

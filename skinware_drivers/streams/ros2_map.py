@@ -45,9 +45,7 @@ _NOT_SHOWN = re.compile(r"(^|\.)(header|stamp|\w*stamp|time|seq|id|\w*_id|index)
 _AXES = re.compile(r"(.*[._])?([xyz])")
 
 
-class MapTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A topic, its type in ROS (as ``std_msgs/msg/Float32MultiArray``), and the meaning of its fields."""
-
+class _MapTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     type: str
     values: tuple[FieldRule, ...] = ()
@@ -56,12 +54,12 @@ class MapTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class _TopicMapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: str
     version: int
-    topic: tuple[MapTopic, ...]
+    topic: tuple[_MapTopic, ...]
     definition: dict[str, str] = {}
 
 
-def read_map(path: str) -> list[tuple[MapTopic, Definitions, Making]]:
-    """Return topics, with the definitions of their types and what makes parts of their messages.
+def read_map(path: str) -> list[tuple[str, Definitions, Making]]:
+    """Return names of topics, with the definitions of their types and what makes parts of their messages.
 
     Raises:
         ConfigurationError: the file cannot be read, or says something that cannot be; the message says where.
@@ -76,7 +74,7 @@ def read_map(path: str) -> list[tuple[MapTopic, Definitions, Making]]:
             making = by_rules(*topic.values) if topic.values else preset(topic.type)
         except ConfigurationError as error:
             raise ConfigurationError(f"{text.place(('topic', number, 'type'))}: {error}") from None
-        found.append((topic, definitions, making))
+        found.append((topic.name, definitions, making))
     return found
 
 

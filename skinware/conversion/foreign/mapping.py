@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -204,17 +205,8 @@ def _structure(driver: DriverMap, picks: list[list[Pick]], source: ColumnSource)
         places = _positions(each, driver.table, source, count)
         positions.append(places)
         frames += [(each.frame or source.frames.get(driver.table, "")) * bool(np.isfinite(places).all())] * count
-    known = np.concatenate(positions)
-    nowhere, uid = np.full(len(known), np.nan), np.array(uids, np.uint64)
-    geometry = Geometry(
-        type_name=np.array(names, object),
-        uid=uid,
-        frame=np.array(frames, object),
-        position_m=known,
-        normal=np.full_like(known, np.nan),
-        radius_m=nowhere,
-        confidence=nowhere,
-    )
+    known, uid = np.concatenate(positions), np.array(uids, np.uint64)
+    geometry = replace(Geometry.unknown(names, uid), frame=np.array(frames, object), position_m=known)
     return Structure(
         types=types.values(),
         buses=[source.path.name],

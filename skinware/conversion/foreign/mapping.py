@@ -42,6 +42,7 @@ from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-columns", 1
 UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+_MOST_PLACES = 1 << 20
 _LENGTHS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _INDEX = re.compile(r"(.+)\[([-\d:, ]+)\]")
@@ -251,8 +252,8 @@ def _positions(each: ModuleMap, table: str, source: ColumnSource, count: int) ->
 def _place_column(source: ColumnSource, table: str, name: str) -> npt.NDArray[np.float64]:
     """Return the first row of a column of the table, or the whole of one of another table."""
     if name in source.tables[table]:
-        return whole(source, table, name, 1)[:1].astype(np.float64)
+        return whole(source, table, [name], 1)[name][:1].astype(np.float64)
     for other, columns in source.tables.items():
         if name in columns:
-            return whole(source, other, name).astype(np.float64)
+            return whole(source, other, [name], _MOST_PLACES)[name].astype(np.float64)
     raise StructureError(_no_column(name, source, table))

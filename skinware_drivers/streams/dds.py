@@ -11,7 +11,6 @@ import logging
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import msgspec
@@ -31,7 +30,7 @@ from skinware_drivers.serial.framing import Field
 from skinware_drivers.serial.packets import Length, Packet
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import ServerBus
+from skinware_drivers.streams.bus import ServerBus, need_package
 
 if TYPE_CHECKING:
     from skinware_drivers.streams.dds_ends import DdsPort
@@ -41,6 +40,7 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 ENCAPSULATION = 4
 LONGEST = 1 << 20
 """Bytes of the longest sample that is read."""
+_PACKAGE = "cyclonedds", "ros2"
 _SYNC = b"\xdd\x5a"
 _HEAD = struct.Struct("<2sIHI")
 _STAMP_NS = 10_000
@@ -127,13 +127,8 @@ class DdsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1024
 
 
-def _need_package(name: str) -> None:
-    if find_spec("cyclonedds") is None:
-        raise ConfigurationError(f"{name}: needs the package cyclonedds: pip install 'skinware[ros2]'")
-
-
 def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    _need_package(f"bus dds://{channel}")
+    need_package(f"bus dds://{channel}", *_PACKAGE)
     from skinware_drivers.streams.dds_ends import DdsDeviceBus
 
     return DdsDeviceBus(channel, options, **more)
@@ -170,6 +165,7 @@ class DdsBus(TopicBus):
             missing.
     """
 
+    scheme: ClassVar[str] = "dds"
     options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
     device_end: ClassVar[Callable[..., Bus] | None] = _device_end
 
@@ -178,12 +174,8 @@ class DdsBus(TopicBus):
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         self.domain: int = parse_domain(channel)
-        _need_package(self.name)
+        need_package(self.name, *_PACKAGE)
         self._joined: DdsPort | None = None
-
-    @property
-    def name(self) -> str:
-        return f"bus dds://{self.channel}"
 
     def check(self) -> None:
         """Report publishers that cannot be read; that none sends is no reason to join the domain again."""

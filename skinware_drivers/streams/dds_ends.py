@@ -8,8 +8,9 @@ import os
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
+import msgspec
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, InstanceState
 from cyclonedds.domain import Domain, DomainParticipant
@@ -21,9 +22,8 @@ from cyclonedds.topic import Topic
 from skinware.errors import BridgeError, BusNotAvailable
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.ros2.cyclone import WaitingThread, join, reason, struct_type, write_bytes
-from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
+from skinware_drivers.streams.bus import StreamBus
 from skinware_drivers.streams.dds import (
     LONGEST,
     SOURCE_TIME,
@@ -248,27 +248,19 @@ class DdsPort(Port):
         return source.reader == reader
 
 
-class DdsDeviceBus(SerialBus):
+class DdsDeviceBus(StreamBus):
     """The devices' end, for emulators: ``skin-emulate --bus dds://DOMAIN`` publishes the records that it is given.
 
     Attributes:
         topics: to publish, by the numbers of records; the first of each number, where there are several.
     """
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self.topics: Sequence[DdsTopic] = ()
-        self._options = options_from_strings(DdsOptions, options or {})
-        self._domain = parse_domain(channel)
-
-    @property
-    def name(self) -> str:
-        return f"bus dds://{self.channel}"
+    scheme: ClassVar[str] = "dds"
+    options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
+    topics: Sequence[DdsTopic] = ()
 
     def _open_port(self) -> Port:
-        return _PublishingPort(self.name, self._domain, self._options, self.topics)
+        return _PublishingPort(self.name, parse_domain(self.channel), self._options, self.topics)
 
 
 class _PublishingPort(Port):

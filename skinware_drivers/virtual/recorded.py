@@ -7,10 +7,11 @@ come from the recording, and the driver need not ask.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
 
 import msgspec
 
@@ -61,7 +62,10 @@ class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     bus: Annotated[str, msgspec.Meta(description="name of the bus, if several were recorded")] = ""
     driver: Annotated[str, msgspec.Meta(description="driver of the bus, if several had it")] = ""
-    speed: Annotated[float, msgspec.Meta(description="2: twice as fast", gt=0)] = 1.0
+    speed: Annotated[
+        Annotated[float, msgspec.Meta(gt=0)] | Literal["max"],
+        msgspec.Meta(description="2: twice as fast; max: as fast as the driver decodes, without losses"),
+    ] = 1.0
     start: Annotated[float, msgspec.Meta(description="where to begin, s since the recording began", ge=0)] = 0.0
     end: Annotated[
         Annotated[float, msgspec.Meta(ge=0)] | None,
@@ -103,7 +107,8 @@ class RecordedPort(EmulatedPort):
         return b"" if frame is None else frame.payload
 
     def next_frame(self) -> WireFrame | None:
-        self._unread += self._hardware.emit(self._clock())
+        if not self._unread:
+            self._unread += self._hardware.emit(self._clock())
         frame = self._unread.popleft() if self._unread else None
         self._wake_when_due()
         if frame is not None:
@@ -306,7 +311,8 @@ def replayed_bus(
     of_driver = [one for one in recording.wires if one.driver == wire.driver]
     first_ns = first_of(of_driver, wanted.start)
     more: dict[str, Any] = {"payload_size": payload_size, "listen_only": listen_only, "clock": clock}
-    play = partial(RecordedWire, items, first_ns, speed=wanted.speed, name=name, note=note)
+    speed = math.inf if wanted.speed == "max" else wanted.speed
+    play = partial(RecordedWire, items, first_ns, speed=speed, name=name, note=note)
     if medium_of(recording, wire) == "modbus":
         hardware = play(waits=False, with_sent=True)
         return ReplayedModbusBus(name, hardware=hardware, over_tcp=_was_over_tcp(wire.items()), **more)

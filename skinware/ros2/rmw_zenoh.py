@@ -25,7 +25,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from skinware.bridge.endpoints import endpoints
+from skinware.bridge.endpoints import Endpoints, endpoints
 from skinware.bridge.link import directly, open_session
 from skinware.errors import BridgeError, MissingExtra
 from skinware.ros2.transport import Cdr, Distro, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
@@ -53,6 +53,15 @@ _NODE = 0
 """Number of the only node in a session."""
 
 
+def graph_endpoints(connect: Sequence[str]) -> Endpoints:
+    """Return the settings of a session in a graph: a peer as nodes of ROS are, with endpoints of routers.
+
+    Raises:
+        ConfigurationError: an endpoint is malformed.
+    """
+    return replace(endpoints(connect=connect), listen=(_LISTEN,), security=_SETTINGS)
+
+
 class ZenohNode:
     """A :class:`skinware.ros2.transport.Node`.
 
@@ -78,10 +87,10 @@ class ZenohNode:
         connect: Sequence[str] = (ROUTER,),
         router_changed: Callable[[bool, str], None] = lambda _is_there, _line: None,
     ) -> None:
-        places = endpoints(connect=connect)
+        places = graph_endpoints(connect)
         self._identity, self._router_changed = identity, router_changed
         self._at = ", ".join(places.connect)
-        self._session = open_session(replace(places, listen=(_LISTEN,), security=_SETTINGS))
+        self._session = open_session(places)
         self._zid = str(self._session.info.zid())
         self._numbers = itertools.count(_NODE + 1)
         self._endpoints: set[_ZenohPublisher | _ZenohService] = set()
@@ -291,6 +300,7 @@ def _as_bridge_error(what: str) -> Iterator[None]:
 
 
 _TOKENS = "@ros2_lv"
+_TOKEN_PARTS = 13
 _NO_HASH = "TypeHashNotSupported"
 _NAME = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -369,6 +379,18 @@ def endpoint_token(
     """Return the token of a publisher or a service, which has a number of its own in the session."""
     place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind.value, *_of_node(identity))
     return "/".join((*place, _mangled(name), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
+
+
+def publisher_of(token: str) -> tuple[str, str]:
+    """Return topic and type in DDS of the publisher with a token.
+
+    Raises:
+        ValueError: it is no token of a publisher.
+    """
+    parts = token.split("/")
+    if len(parts) != _TOKEN_PARTS or parts[5] != EndpointKind.PUBLISHER.value:
+        raise ValueError(f"{token!r} is no token of a publisher")
+    return parts[9].replace("%", "/"), parts[10]
 
 
 def qos_text(qos: Qos) -> str:

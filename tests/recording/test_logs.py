@@ -204,7 +204,8 @@ def test_a_log_at_full_speed_is_read_completely(tmp_path: Path) -> None:
         clock = HandClock()
         bus = replayed_bus(str(path), {"speed": "max"}, listen_only=True, clock=clock)
         bus.open()
-        batch, found = FrameBatch.for_buses(1, 8), []
+        batch = FrameBatch.for_buses(1, 8)
+        found: list[int] = []
         while len(found) < n and bus.receive(batch, 0):
             rows = batch.wire[batch.start : batch.stop]
             found += rows["payload"][:, :4].copy().view(">u4")[:, 0].tolist()

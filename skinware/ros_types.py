@@ -63,7 +63,7 @@ _DDS_NAME = re.compile(r"(\w+)::(msg|srv)::dds_::(\w+)_")
 _DEEPEST = 16
 
 
-class Field(NamedTuple):
+class MessageField(NamedTuple):
     """A field of a definition.
 
     Attributes:
@@ -78,6 +78,10 @@ class Field(NamedTuple):
     longest: int = 0
     length: int | None = None
     most: int = 0
+
+
+_OF_EMPTY = MessageField("structure_needs_at_least_one_member", "uint8")
+"""The field that ROS gives a message without any."""
 
 
 class Definitions:
@@ -97,10 +101,10 @@ class Definitions:
     def __init__(self, type_name: str, texts: Mapping[str, str]) -> None:
         self.type_name = type_name
         self.texts: dict[str, str] = {}
-        self._fields: dict[str, Sequence[Field]] = {}
+        self._fields: dict[str, Sequence[MessageField]] = {}
         self._add(_without_msg(type_name), texts, ())
 
-    def __getitem__(self, type_name: str) -> Sequence[Field]:
+    def __getitem__(self, type_name: str) -> Sequence[MessageField]:
         return self._fields[_without_msg(type_name)]
 
     def _add(self, type_name: str, texts: Mapping[str, str], outer: tuple[str, ...]) -> None:
@@ -123,10 +127,10 @@ class Definitions:
                 kind = _qualified(plain, type_name)
                 self._add(kind, texts, (*outer, type_name))
             length = None if not is_list else 0 if is_bounded else int(count or 0)
-            fields.append(Field(name, kind, int(longest or 0), length, int(count) if is_bounded else 0))
+            fields.append(MessageField(name, kind, int(longest or 0), length, int(count) if is_bounded else 0))
             lines.append(line[: match.end(6)])
         self.texts[type_name] = "\n".join([*lines, ""])
-        self._fields[type_name] = fields or [Field("structure_needs_at_least_one_member", "uint8")]  # as ROS does
+        self._fields[type_name] = fields or [_OF_EMPTY]
 
 
 def dds_name(type_name: str) -> str:

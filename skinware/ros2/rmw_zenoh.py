@@ -54,11 +54,7 @@ _NODE = 0
 
 
 def graph_endpoints(connect: Sequence[str]) -> Endpoints:
-    """Return the settings of a session in a graph: a peer as nodes of ROS are, with endpoints of routers.
-
-    Raises:
-        ConfigurationError: an endpoint is malformed.
-    """
+    """Return the settings of a peer in a graph, with endpoints of routers; ConfigurationError: one is malformed."""
     return replace(endpoints(connect=connect), listen=(_LISTEN,), security=_SETTINGS)
 
 
@@ -300,7 +296,6 @@ def _as_bridge_error(what: str) -> Iterator[None]:
 
 
 _TOKENS = "@ros2_lv"
-_TOKEN_PARTS = 13
 _NO_HASH = "TypeHashNotSupported"
 _NAME = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -378,19 +373,7 @@ def endpoint_token(
 ) -> str:
     """Return the token of a publisher or a service, which has a number of its own in the session."""
     place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind.value, *_of_node(identity))
-    return "/".join((*place, _mangled(name), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
-
-
-def publisher_of(token: str) -> tuple[str, str]:
-    """Return topic and type in DDS of the publisher with a token.
-
-    Raises:
-        ValueError: it is no token of a publisher.
-    """
-    parts = token.split("/")
-    if len(parts) != _TOKEN_PARTS or parts[5] != EndpointKind.PUBLISHER.value:
-        raise ValueError(f"{token!r} is no token of a publisher")
-    return parts[9].replace("%", "/"), parts[10]
+    return "/".join((*place, name.replace("/", "%"), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
 
 
 def qos_text(qos: Qos) -> str:
@@ -407,11 +390,7 @@ def gid(token: str) -> bytes:
 
 
 def _of_node(identity: NodeIdentity) -> tuple[str, str, str]:
-    return "%", _mangled(identity.namespace), identity.name
-
-
-def _mangled(name: str) -> str:
-    return name.replace("/", "%")
+    return "%", identity.namespace.replace("/", "%"), identity.name
 
 
 def _hash(identity: NodeIdentity, of_type: MessageType) -> str:

@@ -138,7 +138,7 @@ News = tuple[int, str]
 """Level of logging, and text."""
 
 
-class Publisher(NamedTuple):
+class TopicSource(NamedTuple):
     """A publisher; ``handle`` is its identity."""
 
     handle: Hashable
@@ -148,7 +148,7 @@ class Publisher(NamedTuple):
 
 
 @dataclass
-class _Source:
+class _ReadSource:
     """The publisher that is read on a topic, and the number of the reader that matched it."""
 
     publisher: Hashable
@@ -163,17 +163,17 @@ class TopicPort(Port):
         publishers: of all topics there, by handle.
         dropped: samples so far that found no room.
         refused: samples so far that were not used.
-        news: of publishers, that nobody took yet.
+        news: of publishers since they were logged last.
     """
 
     longest_wait = 0
 
     def __init__(self, topics: Sequence[DdsTopic]) -> None:
         self.topics = topics
-        self.publishers: dict[Hashable, Publisher] = {}
+        self.publishers: dict[Hashable, TopicSource] = {}
         self.dropped = self.refused = 0
         self.news: list[News] = []
-        self._sources: dict[str, _Source] = {}
+        self._sources: dict[str, _ReadSource] = {}
 
     def write(self, data: bytes) -> int:
         """Publish nothing."""
@@ -198,7 +198,7 @@ class TopicPort(Port):
         """Return the types in DDS that a topic may have."""
         return [topic.dds_type for topic in self.topics if topic.name == name]
 
-    def came(self, one: Publisher) -> bool:
+    def came(self, one: TopicSource) -> bool:
         """Note a publisher; return whether it is one of a topic to read."""
         types = self.types_of(one.topic)
         if one.handle in self.publishers or len(self.publishers) >= _MOST_PUBLISHERS:
@@ -231,7 +231,7 @@ class TopicPort(Port):
         """
         source = self._sources.get(topic)
         if source is None or time_ns - source.heard_ns > _SILENT_NS:
-            source = self._sources[topic] = _Source(publisher, reader, time_ns)
+            source = self._sources[topic] = _ReadSource(publisher, reader, time_ns)
         if source.publisher != publisher:
             self.refused += 1
             return False

@@ -28,8 +28,8 @@ from skinware_drivers.streams.dds import (
     SOURCE_TIME,
     DdsOptions,
     DdsTopic,
-    Publisher,
     TopicPort,
+    TopicSource,
     parse_domain,
     record,
     samples,
@@ -63,7 +63,7 @@ class DdsPort(TopicPort):
     def __init__(self, name: str, domain: int, options: DdsOptions, topics: Sequence[DdsTopic]) -> None:
         super().__init__(topics)
         self._name, self._options = name, options
-        self._unjudged: deque[Publisher] = deque()
+        self._unjudged: deque[TopicSource] = deque()
         self._rejected = 0
         self._domain, self._participant = _joined(name, domain, options)
         self._readers: dict[int, DataReader] = {}
@@ -127,7 +127,7 @@ class DdsPort(TopicPort):
                 handle = one.sample_info.instance_handle
                 if not one.sample_info.valid_data or one.sample_info.instance_state != InstanceState.Alive:
                     self.went(handle)
-                elif self.came(publisher := Publisher(handle, one.topic_name, one.type_name, time_ns)):
+                elif self.came(publisher := TopicSource(handle, one.topic_name, one.type_name, time_ns)):
                     self._unjudged.append(publisher)
                     for number, topic in enumerate(self.topics):
                         if (topic.name, topic.dds_type) == publisher[1:3] and number not in self._readers:

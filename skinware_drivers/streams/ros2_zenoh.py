@@ -16,16 +16,18 @@ from typing import Annotated, ClassVar
 import msgspec
 from msgspec import Meta
 
-from skinware.errors import BridgeError, BusNotAvailable, MissingExtra
+from skinware.errors import BridgeError, BusNotAvailable, ConfigurationError, MissingExtra
 from skinware.realtime import now_ns
-from skinware_drivers.streams.dds import LONGEST, DdsTopic, Publisher, TopicBus, TopicPort, parse_domain, record
+from skinware_drivers.bus import Bus
+from skinware_drivers.streams.dds import LONGEST, DdsTopic, TopicBus, TopicPort, TopicSource, parse_domain, record
 
 if find_spec("zenoh") is None or find_spec("xxhash") is None:
     raise MissingExtra("a bus ros2:// needs packages that are not installed: pip install 'skinware[ros2-zenoh]'")
 
 from skinware.bridge.link import Link
-from skinware.ros2.rmw_zenoh import ROUTER, MessageAttachment, gid, graph_endpoints, publisher_of
+from skinware.ros2.rmw_zenoh import ROUTER, MessageAttachment, gid, graph_endpoints
 
+_TOKEN_PARTS = 13
 _AT_ONCE = 64
 """Samples in one read."""
 
@@ -35,6 +37,10 @@ class ZenohOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth: Annotated[
         int, Meta(ge=1, le=65536, description="samples that wait to be read; further ones are dropped")
     ] = 1024
+
+
+def _no_device_end(channel: str, *_: object, **_more: object) -> Bus:
+    raise ConfigurationError(f"bus ros2://{channel}: is only read: emulated devices publish on dds://{channel}")
 
 
 class ZenohTopicBus(TopicBus):
@@ -48,6 +54,7 @@ class ZenohTopicBus(TopicBus):
     """
 
     scheme: ClassVar[str] = "ros2"
+    device_end: ClassVar[Callable[..., Bus] | None] = _no_device_end
     options_class: ClassVar[type[msgspec.Struct]] = ZenohOptions
 
     def __init__(
@@ -58,6 +65,18 @@ class ZenohTopicBus(TopicBus):
 
     def _join(self, topics: Sequence[DdsTopic]) -> TopicPort:
         return ZenohPort(self.name, self.domain, self._options, topics)
+
+
+def publisher_of(token: str) -> tuple[str, str]:
+    """Return topic and type in DDS of the publisher with a token.
+
+    Raises:
+        ValueError: it is no token of a publisher.
+    """
+    parts = token.split("/")
+    if len(parts) != _TOKEN_PARTS or parts[5] != "MP":
+        raise ValueError(f"{token!r} is no token of a publisher")
+    return parts[9].replace("%", "/"), parts[10]
 
 
 class ZenohPort(TopicPort):
@@ -105,7 +124,7 @@ class ZenohPort(TopicPort):
             with contextlib.suppress(ValueError):
                 topic, type_name = publisher_of(token)
                 if is_there:
-                    self.came(Publisher(gid(token), f"rt{topic}", type_name, time_ns))
+                    self.came(TopicSource(gid(token), f"rt{topic}", type_name, time_ns))
                 else:
                     self.went(gid(token))
         return has_changed

@@ -115,7 +115,6 @@ class RecordedWire:
         self._with_sent, self._name, self._note = with_sent, name, note
         self._questions = Questions(waits=waits)
         self._next: WireItem | None = None
-        self._most = _AT_ONCE if math.isinf(speed) else sys.maxsize
         self._begun_ns = self._given_ns = self._looked_ns = self._reached_ns = 0
         self._has_begun = self.is_over = False
         self._counts = {"frames": 0, "bursts": 0, "commands": 0}
@@ -142,7 +141,8 @@ class RecordedWire:
     def emit(self, now_ns: int) -> list[WireFrame]:
         found: list[WireFrame] = []
         self._looked_ns = now_ns
-        while (item := self._next) is not None and len(found) < self._most:
+        most = _AT_ONCE if math.isinf(self._speed) else sys.maxsize
+        while (item := self._next) is not None and len(found) < most:
             if self._due_ns(item) > now_ns and not self._hurry(item, now_ns):
                 break
             if item.is_sent:

@@ -14,14 +14,14 @@ import pytest
 
 from skinware import DriverSnapshot, Namespace
 from skinware.errors import ConfigurationError
-from skinware.ros2.rmw_zenoh import MessageAttachment, ZenohNode, publisher_of
+from skinware.ros2.rmw_zenoh import MessageAttachment, ZenohNode
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
 from skinware.status import Status
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.dds import DdsTopic
 from skinware_drivers.streams.ros2 import Ros2Driver, Ros2Options
 from skinware_drivers.streams.ros2_presets import TEXTS
-from skinware_drivers.streams.ros2_zenoh import ZenohPort, ZenohTopicBus
+from skinware_drivers.streams.ros2_zenoh import ZenohPort, ZenohTopicBus, publisher_of
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import run
@@ -184,6 +184,11 @@ def test_topics_are_found(at: Router) -> None:
 def test_names_that_are_wrong(name: str) -> None:
     with pytest.raises(ConfigurationError):
         emulated_skin("ros2", bus=name).__enter__()
+
+
+def test_emulated_devices_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="emulated devices publish on dds://0"):
+        make_bus("ros2://0", for_devices=True)
 
 
 @pytest.mark.parametrize("token", ["", "@ros2_lv/0/a/0/1/SS/%/%/n/%t/T/h/::", "@ros2_lv/0/a/0/1/MP/%/%/n/%t"])

@@ -113,22 +113,29 @@ def check_rows(folder: Path, name: str, busy: int) -> None:
     period_ns = series.origin.period_ns
     image = TouchImage(layout, "pressure", positions, 48, 96, Colours("grey", *range_of(layout, "pressure")))
     of_all, late, offs = 0, 0, []
-    for row, time_ns in enumerate(times_ns.tolist()):
+    age_ns = np.rint(state[:, names.index("touch.age_s")].astype(np.float64) * 1e9).astype(np.int64)
+    for row, logged_ns in enumerate(times_ns.tolist()):
+        close = np.flatnonzero(np.abs(acquired_ns - logged_ns) < 2_000_000_000)
+        equal = [frame for frame in close if np.array_equal(values[frame].astype(np.float32), state[row, columns])]
+        assert equal, f"{name}, row {row}: no frame of its time has these values"
+        # the moment that was asked for, just before the robot logged its own
+        frame = min(equal, key=lambda each: abs(acquired_ns[each] + age_ns[row] - logged_ns))
+        time_ns = int(acquired_ns[frame] + age_ns[row])
+        assert -TIE_NS < logged_ns - time_ns < 500_000_000, f"{name}, row {row}: {(logged_ns - time_ns) / 1e6:.1f} ms"
         distance = np.abs(acquired_ns - time_ns)
         nearest = nearest_so_far(distance, series.published_ns, time_ns)
-        found = [frame for frame in nearest if np.array_equal(values[frame].astype(np.float32), state[row, columns])]
-        assert found, f"{name}, row {row}: not the frame nearest to its time of those that there were"
-        of_all += distance[found[0]] <= distance.min() + TIE_NS
-        if found[0] == nearest[0] and distance[found[0]] > period_ns / 2 + TIE_NS:
-            late += 1  # a nearer one, if there was any, was later than it was waited for
-            nearer = [frame for frame in nearest[1:] if distance[frame] < distance[found[0]] - TIE_NS]
-            assert all(series.published_ns[frame] > time_ns + period_ns for frame in nearer), row
+        assert frame in nearest, f"{name}, row {row}: not the frame nearest to its time of those that there were"
+        of_all += distance[frame] <= distance.min() + TIE_NS
+        if distance[frame] > period_ns / 2 + TIE_NS:  # a nearer one, if there was any, was later than it was waited for
+            late += 1
+            nearer = [each for each in nearest if distance[each] < distance[frame] - TIE_NS]
+            assert all(series.published_ns[each] > time_ns + period_ns for each in nearer), (
+                f"{name}, row {row}: too soon"
+            )
         picture = np.asarray(dataset[row]["observation.images.touch"])
         picture = np.rint(picture * 255).astype(np.uint8).transpose(1, 2, 0)
-        assert any(np.array_equal(picture, image.of(values[frame])) for frame in nearest), (
-            f"{name}, row {row}: its image"
-        )
-        offs.append(distance[found[0]] / 1e6)
+        assert any(np.array_equal(picture, image.of(values[each])) for each in nearest), f"{name}, row {row}: its image"
+        offs.append(distance[frame] / 1e6)
     within = float(np.mean(np.array(offs) <= period_ns / 2e6))
     span_s = sum(np.ptp(times_ns[rows_of(dataset, number)]) for number in range(EPISODES)) / 1e9
     print(

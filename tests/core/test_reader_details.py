@@ -259,6 +259,15 @@ def test_what_c_took_is_counted_when_the_reader_attaches_again() -> None:
         assert reader.statistics.frames == 5
 
 
+def test_a_view_is_a_turn_that_ends_with_its_block() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
+        for number in (1, 2):
+            publish(writer, number)
+            with reader.view():
+                assert reader.statistics.age.total == number - 1
+            assert (reader.statistics.frames, reader.statistics.age.total) == (number, number)
+
+
 # -- waiting -------------------------------------------------------------------------------------------------------
 
 
@@ -345,7 +354,8 @@ class Deadlines(ServiceReader[Sample]):
     def _read(self, *how: Any) -> Any:
         return how[-1]
 
-    _read_in_order = _read
+    def _read_in_order(self, deadline_ns: int) -> Any:
+        return deadline_ns
 
 
 def test_the_time_that_passed_in_c_counts() -> None:
@@ -387,6 +397,19 @@ def test_a_sample_of_a_later_generation_is_found_at_once_though_the_earlier_one_
             publish(later, 2)
             monkeypatch.setattr(Word, "wait", refuse_to_wait)
             assert reader.read(newer_than=(later.generation, 0), timeout_s=0).position == (later.generation, 1)
+
+
+def test_a_loop_does_not_change_what_is_newer_than_a_position() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
+        samples = reader.samples(timeout_s=5)
+        for value in (1, 2):
+            publish(writer, value)
+            assert next(samples).sequence == value
+        publish(writer, 3)
+        with pytest.raises(ServiceTimeout):
+            reader.read(newer_than=(writer.generation, 3), timeout_s=0)
+        assert next(samples).sequence == 3
+        assert reader.read(newer_than=(writer.generation, 1), timeout_s=0).sequence == 3
 
 
 def test_a_reader_looks_for_no_other_generation_while_samples_come() -> None:

@@ -153,8 +153,10 @@ class Two:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for thing in (*self.readers, *self.writers):
-            thing.close()
+        for reader in self.readers:
+            reader.close()
+        for writer in self.writers:
+            writer.close()
 
     def resume(self) -> None:
         """The newest of both has been taken."""

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from skinware import DriverReader, DriverWriter, Namespace, Sample, ServiceReader, ServiceWriter
-from skinware.errors import Overrun, PeerGone, RequestRefused, ServiceNotFound, ServiceTimeout
+from skinware.errors import Closed, Overrun, PeerGone, RequestRefused, ServiceNotFound, ServiceTimeout
 from skinware.memory import ring as ring_module
 from skinware.memory.announcement import living_readers
 from skinware.memory.futex import Word
@@ -23,7 +23,7 @@ from skinware.service import _reader as reader_module
 from skinware.service._reader import Tap
 from skinware.service._taking import Accounts
 from tests.cli.fake_skin import fake_structure
-from tests.core.services import SMALL, publish
+from tests.core.services import SMALL, at_0, publish
 from tests.core.test_losses import die
 
 MS = 1_000_000
@@ -418,6 +418,19 @@ def test_a_reader_looks_for_no_other_generation_while_samples_come() -> None:
             publish(writer, value)
             assert reader.read(newer_than=(writer.generation, value - 1), max_age_s=1e6).sequence == value
             assert reader.read().sequence == value
+
+
+def test_a_reader_whose_descriptor_is_0_reads() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
+        with at_0(reader._ring.segment.descriptor):
+            publish(writer, 1)
+            assert reader.alive
+            assert reader.refresh() == writer.position
+            assert reader.read().position == writer.position
+            assert reader.read(newer_than=(writer.generation, 0)).position == writer.position
+        reader.close()
+        with pytest.raises(Closed):
+            reader.refresh()
 
 
 def vanish(writer: ServiceWriter) -> None:

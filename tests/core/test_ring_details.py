@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import resource
-import threading
+import signal
 from collections.abc import Callable
 from typing import Self
 
@@ -250,21 +251,23 @@ def test_a_wait_for_several_rings_ends_without_news() -> None:
             assert two.next(NEWER, timeout_ns) == []
 
 
-def test_words_that_change_before_the_sleep_begins_are_no_reason_to_leave_it_to_python() -> None:
-    over = threading.Event()
-
-    def wake(writer: RingWriter) -> None:
-        while not over.is_set():
-            writer.wake()
-
+def test_every_wake_of_any_ring_ends_a_wait_and_none_is_left_to_python() -> None:
+    """Also one that comes before the sleep has begun. Another process wakes, which needs no interpreter lock."""
     with Two() as two:
-        thread = threading.Thread(target=wake, args=(two.writers[1]._ring,))
-        thread.start()
+        ring = two.readers[1]._ring
+        child = os.fork()
+        if child == 0:
+            while True:
+                two.writers[1]._ring.wake()
         try:
-            assert [two.next(NEWER, MS) for _ in range(100)] == [[]] * 100
+            begun, calls = ring.wake_count, 0
+            while ring.wake_count - begun < 200_000:
+                assert two.next(NEWER, HOUR_NS) == []
+                calls += 1
         finally:
-            over.set()
-            thread.join()
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+        assert calls > 50  # a wait that no wake ends takes 50 ms
 
 
 def sleeps() -> int:

@@ -292,10 +292,15 @@ def test_a_service_that_is_not_there_is_looked_for_ten_times_a_second_until_the_
         clock.rate_hz = rate_hz
         return SimpleNamespace(wait=wait)
 
-    monkeypatch.setattr(_attachment, "now_ns", lambda: clock.now_ns)
+    def look() -> int:
+        clock.looks += 1
+        assert clock.looks < 20
+        return int(clock.now_ns)
+
+    monkeypatch.setattr(_attachment, "now_ns", look)
     monkeypatch.setattr(_attachment, "Periodic", periodic)
     for timeout_s, waits in ((0.0, 0), (0.3, 3), (1.05, 11)):
-        clock.waits = 0
+        clock.waits = clock.looks = 0
         with pytest.raises(ServiceNotFound):
             ServiceReader[Sample]("x", timeout_s=timeout_s)
         assert clock.waits == waits

@@ -317,7 +317,7 @@ def test_without_a_limit_a_service_is_looked_for_until_it_is_there(monkeypatch: 
     monkeypatch.setattr(_attachment, "Periodic", lambda _: SimpleNamespace(wait=wait))
     with ServiceReader[Sample]("x", timeout_s=None) as reader:
         assert list(waits) == []
-        assert reader.latest is None
+        assert reader.newest_position is None
     made.pop().close()
 
 
@@ -490,7 +490,7 @@ def test_what_a_reader_knows_of_a_service_is_kept_while_its_columns_are_equal() 
 def test_a_tap_says_what_the_ring_holds() -> None:
     with ServiceWriter("x", SMALL, slots=8, rate_hz=100) as writer, Tap[Sample]("x") as tap:
         assert (tap.period_ns, tap.slack_ns) == (10 * MS, 80 * MS)
-        assert (tap.latest, tap.last_taken, tap.moved_on) == (None, None, False)
+        assert (tap.newest_position, tap.last_taken, tap.moved_on) == (None, None, False)
         for look in (tap.newest_acquired_ns, lambda: tap.nearest(5)):
             with pytest.raises(Overrun, match="no sample could be read"):
                 look()
@@ -498,7 +498,7 @@ def test_a_tap_says_what_the_ring_holds() -> None:
             writer.begin()
             writer.commit(acquired_ns)
         assert tap.newest_acquired_ns() == tap.newest().acquired_ns == 300
-        assert tap.latest == tap.last_taken == (writer.generation, 3)
+        assert tap.newest_position == tap.last_taken == (writer.generation, 3)
         assert bytes(writer._ring.segment.head) == tap.head
         slot_headers_of(writer._ring.segment)[3][0] = 0  # it is overwritten
         assert tap.newest_acquired_ns() == 200
@@ -515,3 +515,17 @@ def test_the_first_nearest_sample_counts_as_taken() -> None:
         assert (tap.last_taken, tap.missed) == ((writer.generation, 2), 0)
         assert tap.nearest(1000).acquired_ns == 300
         assert (tap.last_taken, tap.missed, tap.statistics.frames) == ((writer.generation, 3), 0, 2)
+
+
+def test_the_samples_around_a_time_are_the_last_by_then_and_the_next() -> None:
+    with ServiceWriter("x", SMALL) as writer, Tap[Sample]("x") as tap:
+        for acquired_ns in (100, 200, 300):
+            writer.begin()
+            writer.commit(acquired_ns)
+        for time_ns, expected in ((0, (100, 100)), (100, (100, 200)), (199, (100, 200)), (200, (200, 300))):
+            assert tuple(sample.acquired_ns for sample in tap.around(time_ns)) == expected
+        for time_ns in (300, 301, 10_000):
+            first, second = tap.around(time_ns)
+            assert first is second
+            assert first.acquired_ns == 300
+        assert (tap.last_taken, tap.missed) == ((writer.generation, 3), 0)

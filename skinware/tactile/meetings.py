@@ -13,8 +13,9 @@ _STEPS = 4
 _SMALL = 1e-9
 _LOG_PEAK = 0.3
 """Spread of the logarithm of a peak from frame to frame."""
-_MISFIT = 0.1
-"""Share of the largest value by which a response may differ from a bell."""
+_MISFIT, _LEAST_VALUE = 0.1, 1e-3
+"""Share of the largest value by which a response may differ from a bell; and of the expected height, below which no value
+counts as large: where a blob has gone nearly or (provisional) has no load, its fit would have no solution."""
 _CLOSE_WIDTHS, _CLOSE_PITCHES, _CLOSE_WAYS = 1.3, 1.2, 1.5
 """Two contacts meet when they come nearer than so many widths, pitches, or shares of their way in a frame."""
 _APART = 1.15
@@ -66,7 +67,7 @@ def fit_bells(
     log_peak = np.log(np.maximum(peak, _SMALL))
     unknown = expected = np.column_stack([place, log_peak])
     prior = np.column_stack([np.tile(1 / variance_m2[:, None], 3), np.full(k, _LOG_PEAK**-2)]).ravel()
-    precision = (_MISFIT * max(value.max(), _SMALL)) ** -2
+    precision = (_MISFIT * max(value.max(), _LEAST_VALUE * peak.max(), _SMALL)) ** -2
     most = np.column_stack([np.tile(width[:, None], 3), np.ones(k)])
     for _ in range(_STEPS):
         away = position[None] - unknown[:, None, :3]

@@ -32,14 +32,11 @@ from skinware.errors import ConfigurationError
 from skinware.native import give_arrays, read_structs
 from skinware.status import Status
 from skinware.structure import Structure
+from skinware.tactile.arrays import Bytes, Flags, Floats
 from skinware.tactile.rule import FORGET_AFTER_S, SIGNED_TYPES, UNUSABLE, BaselineSettings, resolution_of
 
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
-
 _STRUCTS = read_structs([Path(native.__file__).with_name("baseline.h")])
-_BLOCKS, _SHOWN = 60, 21
-"""Numbers of a taxel that is measured, and bytes of a taxel that is shown."""
+_BLOCKS, _SHOWN = 60, 21  # numbers of a taxel that is measured, and bytes of a taxel that is shown
 _WHERE_NONE = {"minimum_on": math.nan, "maximum_hold_s": math.inf}
 _NO_VALUE, _NO_NOISE = -1, -2
 _LEARNED = (
@@ -85,7 +82,7 @@ class Calm:
     baseline: Floats
     uncertainty: Floats
     noise: Floats
-    why: npt.NDArray[np.uint8]
+    why: Bytes
     forced: Flags
     usable: Flags
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Flags, Floats
 from skinware.tactile.baseline import Baseline, Calm
 from skinware.tactile.curves import TEMPERATURE
 from skinware.tactile.rule import BaselineSettings
@@ -70,11 +70,11 @@ class BaselineStage(Stage):
             common=taxels.common,
             limits=(before.minimum, before.maximum),
         )
-        self.given: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
+        self.given: Floats = np.full(len(taxels), np.nan, np.float32)
         self.calm: Calm | None = None
 
     @property
-    def touched(self) -> npt.NDArray[np.bool_]:
+    def touched(self) -> Flags:
         """(n,) bool, which taxels are touched in the newest frame."""
         return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
 

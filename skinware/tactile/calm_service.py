@@ -44,8 +44,7 @@ class CalmRequests:
     def __init__(self, driver: str) -> None:
         self._driver = driver
         self.chain: Chain | None = None
-        self._waiting: list[tuple[int, Request]] = []
-        """Requests for a frame, each with the time at which it came."""
+        self._waiting: list[tuple[int, Request]] = []  # requests for a frame, each with the time at which it came
 
     @property
     def operations(self) -> dict[str, Callable[..., object]]:

@@ -44,18 +44,12 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
+from skinware.tactile.arrays import Bytes, Flags, Floats
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.baseline_stage import RESTLESS, BaselineStage, BaselineStageSettings
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
 from skinware.tactile.rule import UNUSABLE
-from skinware.tactile.stages import (
-    AmplifierSettings,
-    FilterSettings,
-    ScalerSettings,
-    Signal,
-    Stage,
-    Taxels,
-)
+from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
 from skinware.tactile.thermal import ThermalSettings
 from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of
 from skinware.toml_text import TomlText
@@ -202,7 +196,7 @@ class Chain:
         self._steps = steps
         self.stages = {name: [stage for stage, names in steps if name in names] for name in taxels}
         self._before = structure
-        self._suspect: dict[str, npt.NDArray[np.bool_]] = {}
+        self._suspect: dict[str, Flags] = {}
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
         self.structure: Structure = structure.replace(types=types, dtype=np.float32)
 
@@ -290,7 +284,7 @@ class Chain:
         """By type, the first baseline of each."""
         return {name: stage.baseline for name, stage in self.baseline_stages.items()}
 
-    def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8]) -> None:
+    def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: Bytes) -> None:
         """Take the next frame through all stages.
 
         Args:
@@ -319,7 +313,7 @@ class Chain:
             of_type = status[index] | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
             status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
 
-    def explain(self, uncertainty: npt.NDArray[np.float32], why: npt.NDArray[np.uint8]) -> None:
+    def explain(self, uncertainty: Floats, why: Bytes) -> None:
         """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""
         for name, stage in self.baseline_stages.items():
             if stage.calm is not None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.tactile.array_file import Arrays, read_arrays, write_arrays
+from skinware.tactile.arrays import Arrays, read_arrays, write_arrays
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.derived_services import CalmHealth
 from skinware.tactile.rule import FORGET_AFTER_S

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.structure import Structure
+from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole
 from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
 from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
@@ -30,10 +31,8 @@ MOST = 64
 NO_CONTACT, BEYOND = -1, -2
 """Values of ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
 
-_CLEARLY = 1.5
-"""A contact must have so many times the load of one that is in the list to take its place."""
-_LEAST_SHARE = 0.1
-"""Share of the newest frame in the value of a taxel that is just touched."""
+_CLEARLY = 1.5  # a contact must have so many times the load of one that is in the list to take its place
+_LEAST_SHARE = 0.1  # share of the newest frame in the value of a taxel that is just touched
 _LEAST_SEEN, _MOST_CUT = 0.5, 0.6
 """Least share of a load that must be above the threshold, and largest share of clipped taxels, for an estimate."""
 
@@ -69,17 +68,17 @@ class Contact:
     peak: float
     n: int
     area_m2: float
-    cop_m: npt.NDArray[np.float32]
-    normal: npt.NDArray[np.float32]
+    cop_m: Floats
+    normal: Floats
     force_n: float
     frame: str
-    velocity_m_s: npt.NDArray[np.float32]
+    velocity_m_s: Floats
     kind: ContactKind
     provisional: bool
     clipped: int
     load_whole: float
     uncertainty: float
-    taxels: npt.NDArray[np.int64]
+    taxels: Whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,21 +99,21 @@ class ContactSet:
     """
 
     id: npt.NDArray[np.uint32]
-    age_s: npt.NDArray[np.float32]
-    load: npt.NDArray[np.float32]
-    peak: npt.NDArray[np.float32]
+    age_s: Floats
+    load: Floats
+    peak: Floats
     n: npt.NDArray[np.uint32]
-    area_m2: npt.NDArray[np.float32]
-    cop_m: npt.NDArray[np.float32]
-    normal: npt.NDArray[np.float32]
-    force_n: npt.NDArray[np.float32]
+    area_m2: Floats
+    cop_m: Floats
+    normal: Floats
+    force_n: Floats
     frame: npt.NDArray[np.int16]
-    velocity_m_s: npt.NDArray[np.float32]
-    kind: npt.NDArray[np.uint8]
-    provisional: npt.NDArray[np.uint8]
+    velocity_m_s: Floats
+    kind: Bytes
+    provisional: Bytes
     clipped: npt.NDArray[np.uint32]
-    load_whole: npt.NDArray[np.float32]
-    uncertainty: npt.NDArray[np.float32]
+    load_whole: Floats
+    uncertainty: Floats
     contact_of: npt.NDArray[np.int16]
     beyond: int
     frames: tuple[str, ...]
@@ -228,11 +227,11 @@ class Contacts:
     def update(
         self,
         value: npt.NDArray[Any],
-        touched: npt.NDArray[np.bool_],
+        touched: Flags,
         time_ns: int,
         *,
-        onset: npt.NDArray[np.bool_] | None = None,
-        clipped: npt.NDArray[np.bool_] | None = None,
+        onset: Flags | None = None,
+        clipped: Flags | None = None,
         uncertainty: npt.NDArray[Any] | None = None,
     ) -> ContactSet:
         """Return the contacts of the next frame.
@@ -287,9 +286,7 @@ class Contacts:
         columns = {name: found[name][order].astype(dtype) for name, (dtype, _) in COLUMNS.items()}
         return ContactSet(contact_of=contact_of, beyond=beyond, frames=self.frames, **columns)
 
-    def _measure(
-        self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
-    ) -> dict[str, npt.NDArray[Any]]:
+    def _measure(self, taxels: Whole, contact: Whole, load: Doubles, count: int) -> dict[str, npt.NDArray[Any]]:
         order = np.argsort(contact, kind="stable")
         taxels, contact, load = taxels[order], contact[order], load[order]
         first = np.searchsorted(contact, np.arange(count))  # each contact has at least one taxel
@@ -318,9 +315,7 @@ class Contacts:
             "frame": frame,
         }
 
-    def _whole(
-        self, found: dict[str, npt.NDArray[Any]], cut: npt.NDArray[np.float64], load: npt.NDArray[np.float64]
-    ) -> npt.NDArray[np.float64]:
+    def _whole(self, found: dict[str, npt.NDArray[Any]], cut: Doubles, load: Doubles) -> Doubles:
         """(count,) the loads of bells of which only what is above the threshold, and below the clipping, was seen."""
         if len(load) and (load > 0).any():
             least = float(load[load > 0].min())
@@ -337,11 +332,11 @@ class Contacts:
 
     def _frame_of(
         self,
-        taxels: npt.NDArray[np.int64],
-        contact: npt.NDArray[np.int64],
-        load: npt.NDArray[np.float64],
-        peak: npt.NDArray[np.float64],
-    ) -> npt.NDArray[np.int64]:
+        taxels: Whole,
+        contact: Whole,
+        load: Doubles,
+        peak: Doubles,
+    ) -> Whole:
         """(count,) the frame in which each contact has its largest value; -1 if no place is known."""
         placed = self._frame[taxels] >= 0
         if not placed.all():  # the largest value at a known place
@@ -354,12 +349,12 @@ class Contacts:
 
 
 def _largest(
-    taxels: npt.NDArray[np.int64],
-    contact: npt.NDArray[np.int64],
-    load: npt.NDArray[np.float64],
+    taxels: Whole,
+    contact: Whole,
+    load: Doubles,
     count: int,
-    listed: npt.NDArray[np.bool_],
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    listed: Flags,
+) -> tuple[Whole, Whole, Doubles]:
     """Those of the largest contacts; one that was listed stays unless another is clearly larger."""
     loads = np.bincount(contact, load, count)
     loads *= np.where(np.bincount(contact, listed, count) > 0, _CLEARLY, 1.0)

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.structure import Structure
+from skinware.tactile.arrays import Flags
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.onsets import ContactEvent, Events
 from skinware.tactile.source_service import (
@@ -119,8 +120,8 @@ class ContactsReader(SourceReader[ContactsSample]):
 class More(TypedDict, total=False):
     """Arguments of :meth:`.Contacts.update` that may be left out."""
 
-    onset: npt.NDArray[np.bool_] | None
-    clipped: npt.NDArray[np.bool_] | None
+    onset: Flags | None
+    clipped: Flags | None
     uncertainty: npt.NDArray[Any] | None
 
 
@@ -161,9 +162,7 @@ class ContactsWriter(SourceWriter):
         source = _source(structure, type_name, driver, self._contacts)
         super().__init__(source, name, f"contacts of {driver or 'a skin'}, {type_name}", **options)
 
-    def publish(
-        self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], acquired_ns: int, **more: Unpack[More]
-    ) -> ContactSet:
+    def publish(self, value: npt.NDArray[Any], touched: Flags, acquired_ns: int, **more: Unpack[More]) -> ContactSet:
         """Find the contacts of the next frame, and publish them.
 
         Args:

@@ -37,8 +37,9 @@ import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, Floats
 from skinware.tactile.rule import UNUSABLE
-from skinware.tactile.stages import Floats, Signal, Stage, StageSettings, Taxels
+from skinware.tactile.stages import Signal, Stage, StageSettings, Taxels
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-curves", 1
@@ -237,9 +238,7 @@ class LoadMemory:
     def __init__(self, n: int) -> None:
         self._follows, self._slow = np.zeros(n), np.zeros(n)
 
-    def step(
-        self, values: npt.NDArray[Any], passed_s: float, play: npt.ArrayLike, creep_s: npt.ArrayLike
-    ) -> npt.NDArray[np.float64]:
+    def step(self, values: npt.NDArray[Any], passed_s: float, play: npt.ArrayLike, creep_s: npt.ArrayLike) -> Doubles:
         """Take the next (n,) values in; return (2, n): how far what follows with play is off, and the slow values."""
         self._follows = np.where(values > 0, np.clip(self._follows, values - play, values + play), 0)
         self._slow += (values - self._slow) * -np.expm1(-passed_s / np.asarray(creep_s))
@@ -285,7 +284,7 @@ class CurveStage(Stage):
         super().__init__(replace(taxels, type=meant, resolution=0.0))
         self.table = table
         self.temperature_c = math.nan
-        self.error: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
+        self.error: Floats = np.full(len(taxels), np.nan, np.float32)
 
     def step(self, signal: Signal) -> None:
         given = signal.values

@@ -20,6 +20,7 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.tactile import motion_service
+from skinware.tactile.arrays import Bytes, Flags, Floats
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
@@ -120,24 +121,24 @@ class Loads:
         vectors = [names for names in chain.vectors if set(names) <= set(chain.baseline_stages)]
         return cls(chain, vectors[0]) if vectors else None
 
-    def usable(self, status: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+    def usable(self, status: Bytes) -> Flags:
         """Return (n,) bool, which taxels have values of this frame, of (n_sensors,) status."""
-        usable: npt.NDArray[np.bool_] = (status[self._indexes[0]] & UNUSABLE) == 0
+        usable: Flags = (status[self._indexes[0]] & UNUSABLE) == 0
         for index in self._indexes[1:]:
             usable &= (status[index] & UNUSABLE) == 0
         return usable
 
-    def values(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def values(self, values: Floats) -> Floats:
         """Return (n,) loads of (n_sensors,) values."""
         return _length([values[index] for index in self._indexes])
 
     @property
-    def touched(self) -> npt.NDArray[np.bool_]:
+    def touched(self) -> Flags:
         """(n,) bool, which taxels are touched in the newest frame."""
-        touched: npt.NDArray[np.bool_] = np.logical_or.reduce([stage.touched for stage in self._stages])
+        touched: Flags = np.logical_or.reduce([stage.touched for stage in self._stages])
         return touched
 
-    def more(self, usable: npt.NDArray[np.bool_], unit: str) -> More:
+    def more(self, usable: Flags, unit: str) -> More:
         """Return onsets, clipped taxels and (in the same unit) uncertainties, as far as they are known."""
         calms = [(stage.given, stage.calm) for stage in self._stages if stage.calm is not None]
         if not calms:
@@ -153,9 +154,9 @@ class Loads:
         }
 
 
-def _length(axes: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+def _length(axes: list[Floats]) -> Floats:
     """Return (n,) lengths of vectors, by their axes (n,) each; one axis is its own length, with its sign."""
-    length: npt.NDArray[np.float32] = axes[0] if len(axes) == 1 else np.sqrt(sum(axis**2 for axis in axes))
+    length: Floats = axes[0] if len(axes) == 1 else np.sqrt(sum(axis**2 for axis in axes))
     return length
 
 
@@ -218,7 +219,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
             )
         )
 
-    def publish(self, values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
+    def publish(self, values: Floats, status: Bytes, acquired_ns: int) -> None:
         """Find the contacts of the next frame, and publish them.
 
         Args:
@@ -281,7 +282,7 @@ class CalmMotion(DerivedService[MotionWriter]):
             )
         )
 
-    def publish(self, contacts: ContactSet, values: npt.NDArray[np.float32], acquired_ns: int) -> None:
+    def publish(self, contacts: ContactSet, values: Floats, acquired_ns: int) -> None:
         """Publish the motion of the next frame, from its contacts and (n,) values."""
         if self._writer is not None:
             with self._or_none():
@@ -301,7 +302,7 @@ class CalmHealth(DerivedService[HealthWriter]):
         super().__init__(name, driver, into, group)
         self.faulty = 0
         self._health: ChainHealth | None = None
-        self._status: npt.NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self._status: Bytes = np.zeros(0, np.uint8)
         self._due_ns = 0
 
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
@@ -324,7 +325,7 @@ class CalmHealth(DerivedService[HealthWriter]):
         if self._health is not None:
             self._health.restore(state)
 
-    def step(self, status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
+    def step(self, status: Bytes, acquired_ns: int) -> None:
         """Take in what the chain made of the next frame; mark sensors with a fault as ``UNHEALTHY``.
 
         Args:

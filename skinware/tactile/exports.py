@@ -14,12 +14,11 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
+from skinware.tactile.arrays import Doubles
 from skinware.tactile.contacts import Contact, ContactSet
 
 ICUB_NEWTONS_PER_COUNT = 0.05
 """Force of a taxel and count in the skin manager of the iCub."""
-
-Vector = npt.NDArray[np.float64]
 
 
 class IcubPart(NamedTuple):
@@ -103,7 +102,7 @@ def tactile_msgs_contacts(
     return messages
 
 
-def _force_n(contact: Contact, newtons_per_load: float | None) -> Vector:
+def _force_n(contact: Contact, newtons_per_load: float | None) -> Doubles:
     size_n = contact.force_n
     if np.isnan(size_n) and newtons_per_load is not None:
         size_n = newtons_per_load * contact.load

@@ -31,31 +31,24 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
+from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_evidence import Dues, Noise, Use
 from skinware.tactile.health_relations import Copies, Dropouts, Twins, lower_median
-from skinware.tactile.health_report import COLUMNS, Flags, Floats, HealthKind, HealthReport
+from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.neighbours import NONE, Table, neighbours
 from skinware.tactile.rule import resolution_of
 
-_CLEAR = 8.0
-"""Times the noise: a touch this high is no flicker."""
-_HARD = 0.25
-"""Share of what a taxel usually shows at most: less is the rest of a touch, and no other touch."""
-_LEAST_NOISE = 0.5
-"""Steps of the values: no taxel counts as quieter."""
-_FEWEST_AROUND = 3
-"""Neighbours with a known share that a comparison with neighbours needs."""
-_ALIKE = 0.9
-"""Correlation with the touches of another taxel, from which a taxel shows them."""
-_SAME = 0.7
-"""Part of another's touches, from which both are shorted."""
+_CLEAR = 8.0  # times the noise: a touch this high is no flicker
+_HARD = 0.25  # share of what a taxel usually shows at most: less is the rest of a touch, and no other touch
+_LEAST_NOISE = 0.5  # steps of the values: no taxel counts as quieter
+_FEWEST_AROUND = 3  # neighbours with a known share that a comparison with neighbours needs
+_ALIKE = 0.9  # correlation with the touches of another taxel, from which a taxel shows them
+_SAME = 0.7  # part of another's touches, from which both are shorted
 _SQUARES, _OTHER_SQUARES = 0.0003, 0.03
 """Squared difference in parts of the squares: at most that of shorted neighbours, at least that of others."""
-_EXCHANGED = 0.5
-"""Share of what is due to another weak taxel, from which a weak taxel is at its place."""
-_OFTEN = 5.0
-"""Times the dropouts of three quarters of the others."""
+_EXCHANGED = 0.5  # share of what is due to another weak taxel, from which a weak taxel is at its place
+_OFTEN = 5.0  # times the dropouts of three quarters of the others
 _USUAL = 0.1
 """Share of the time: where typical taxels are at an end of the range for longer, that end is where they rest."""
 
@@ -102,16 +95,16 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
 class _Related:
     """Which of n taxels show what presses others: the kind of fault, those others, and how much of it."""
 
-    kind: npt.NDArray[np.uint8]
+    kind: Bytes
     other: npt.NDArray[np.int32]
-    shown: npt.NDArray[np.float64]
+    shown: Doubles
 
     def note(
         self,
         kind: HealthKind,
-        taxels: npt.NDArray[np.int64],
-        others: npt.NDArray[np.int64],
-        shown: npt.NDArray[np.float64],
+        taxels: Whole,
+        others: Whole,
+        shown: Doubles,
     ) -> None:
         self.kind[taxels], self.other[taxels], self.shown[taxels] = kind, others, shown
 
@@ -154,8 +147,7 @@ class Health:
         self._dues = Dues(geometry, self._neighbours)
         self._dropouts = Dropouts(self._neighbours)
         self._copies, self._twins = Copies(self._module, self._neighbours), Twins(self._neighbours)
-        self._clear = _CLEAR * self._least_noise
-        """A touch above it is clear."""
+        self._clear = _CLEAR * self._least_noise  # a touch above it is clear
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, settings: HealthSettings | None = None) -> Self:
@@ -252,7 +244,7 @@ class Health:
         }
         return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
 
-    def _related(self, shown: npt.NDArray[np.float64]) -> _Related:
+    def _related(self, shown: Doubles) -> _Related:
         """Find the taxels whose signals belong to others."""
         settings, n = self.settings, len(shown)
         related = _Related(np.zeros(n, np.uint8), np.full(n, -1, np.int32), np.full(n, math.nan))
@@ -314,7 +306,7 @@ class Health:
         at_end: Flags = (values <= least) | (values >= most)
         return at_end
 
-    def _stuck(self, still_s: npt.NDArray[np.float64], dead: Flags) -> Flags:
+    def _stuck(self, still_s: Doubles, dead: Flags) -> Flags:
         """Find taxels that have not changed for long, although their module was touched, and that nothing holds now."""
         long = still_s >= self.settings.stuck_s
         found = np.zeros(len(long), bool)
@@ -330,7 +322,7 @@ class Health:
         found[rows] = touched_since & ~is_held
         return found
 
-    def _median_around(self, shares: npt.NDArray[np.float64], part: float) -> npt.NDArray[np.float64]:
+    def _median_around(self, shares: Doubles, part: float) -> Doubles:
         """(n,) the median share of the neighbours, where a taxel's own may be less than a part of it; else NaN."""
         around = np.full(len(shares), math.nan)
         most = np.nanmax(shares) if np.isfinite(shares).any() else 0.0

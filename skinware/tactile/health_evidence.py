@@ -9,30 +9,23 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.geometry import Geometry
+from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
 from skinware.tactile.baseline import Calm
-from skinware.tactile.health_relations import APART_S, KEPT, Exchanges, Flags, Floats, Whole
+from skinware.tactile.health_relations import APART_S, KEPT, Exchanges
 from skinware.tactile.neighbours import NONE, Table, pitch_m
 
-_ENOUGH_FRAMES = 100
-"""Frames away from touches that a measurement of noise needs; with fewer it goes on."""
-_GROWTH = 1.2
-"""Times: a noise grows by at most this from one measurement to the next."""
-_MODULE_APART_S = 5.0
-"""Seconds: the same for a module, of which fingers touch one part after the other."""
-_MOST_AT_ONCE = 2048
-"""Touched taxels that are compared in one frame; if there are more, each frame takes another part."""
-_NEAR_PITCHES = 1.3
-"""Pitches: only the nearest ring of neighbours says much about the taxel in the middle."""
+_ENOUGH_FRAMES = 100  # frames away from touches that a measurement of noise needs; with fewer it goes on
+_GROWTH = 1.2  # times: a noise grows by at most this from one measurement to the next
+_MODULE_APART_S = 5.0  # seconds: the same for a module, of which fingers touch one part after the other
+_MOST_AT_ONCE = 2048  # touched taxels that are compared in one frame; if there are more, each frame takes another part
+_NEAR_PITCHES = 1.3  # pitches: only the nearest ring of neighbours says much about the taxel in the middle
 _OPPOSITE_COSINE = -0.9
 """Cosine of the angle from one neighbour to the other: they are opposite beyond some 155 degrees."""
-_SETTLED_TOUCHES = 20
-"""Touches after which a share is known well."""
-_HARD_SQUARE = 0.25
-"""Part of the mean square of what was due: the share of a weaker touch says little."""
+_SETTLED_TOUCHES = 20  # touches after which a share is known well
+_HARD_SQUARE = 0.25  # part of the mean square of what was due: the share of a weaker touch says little
 _BEST_KEPT = 0.9995
 """Part of the best share that a touch leaves: what a taxel showed is forgotten within thousands of touches."""
-_EVEN = 1.4
-"""Times: the farther of two opposite neighbours is at most this much farther than the nearer."""
+_EVEN = 1.4  # times: the farther of two opposite neighbours is at most this much farther than the nearer
 
 
 class Noise:
@@ -62,8 +55,7 @@ class Noise:
         self._low: Flags = np.zeros(n, bool)
         self._stays_low: Flags = np.zeros(n, bool)
         """Taxels that were low before the last measurement ended: no baseline follows these."""
-        self._before_low: Floats = np.zeros((3, n), np.float32)
-        """The sums when each taxel fell."""
+        self._before_low: Floats = np.zeros((3, n), np.float32)  # the sums when each taxel fell
 
     def add(self, now_s: float, difference: Floats, at_end: Flags, low: Flags, free: Flags, calm: Calm) -> bool:
         """Take the next frame in.
@@ -141,7 +133,7 @@ class Use:
         self._module = module
         self.seen: Flags = np.zeros(n, bool)
         self.value: Floats = np.full(n, np.nan, np.float32)
-        self.changed_s: npt.NDArray[np.float64] = np.zeros(n)
+        self.changed_s: Doubles = np.zeros(n)
         self.touched: Flags = np.zeros(n, bool)
         self.peak: Floats = np.zeros(n, np.float32)
         self.usual: Floats = np.zeros(n, np.float32)
@@ -225,10 +217,10 @@ class Dues:
         self._hardest_due[middle[harder]], self._hardest_shown[middle[harder]] = due[harder], shown[harder]
         self.exchanges.note(middle[harder], above)
 
-    def share_shown(self, touches: int) -> npt.NDArray[np.float64]:
+    def share_shown(self, touches: int) -> Doubles:
         """Return (n,) the share of its due that each taxel showed; NaN after fewer touches."""
         known = (self.touches >= touches) & (self.due > 0)
-        share: npt.NDArray[np.float64] = np.where(known, self.shown, math.nan) / np.where(known, self.due, 1)
+        share: Doubles = np.where(known, self.shown, math.nan) / np.where(known, self.due, 1)
         return share
 
     def _end_touches(self, taxels: Whole) -> None:

@@ -8,41 +8,26 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
 from skinware.tactile.baseline import Calm
 from skinware.tactile.neighbours import NONE, Table
-
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
-Whole = npt.NDArray[np.int64]
 
 KEPT = 0.95
 """Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
 APART_S = 1.0
 """Seconds: touches of a taxel with less time between them count as one."""
-_MOST_EXCHANGED = 64
-"""Weak taxels that are compared with each other."""
-_MOST_COMPARED = 1024
-"""Touched taxels that are compared with their neighbours in one frame."""
-_PLAIN = 24.0
-"""Times the noise: weaker touches do not show whether two taxels are the same."""
-_STEADY = 0.25
-"""Share of a jump: neighbours that change less have not felt it."""
-_STILL_FRAMES = 5
-"""Frames without a large change before a value is lost: noise is large in each."""
-_BACK = 0.2
-"""Share of a jump: the value is back if it differs by less from the one before."""
-_LOST_S = 2.0
-"""Seconds: what lasts longer is no dropout."""
-_FORGET_S = 600.0
-"""Seconds in which half of the dropouts are forgotten."""
-_CHANGE_S = 0.4
-"""Seconds between values that are compared: a slow stroke changes little from one frame to the next."""
-_BELOW = 0.8
-"""Part of its value that another must show, where a taxel seems to be touched alone."""
-_MOST_SHARE = 1.25
-"""Part of the touches of another, beyond which they are not the reason of its own."""
-_MOST_ALONE = 256
-"""Taxels that are compared with all others of their modules."""
+_MOST_EXCHANGED = 64  # weak taxels that are compared with each other
+_MOST_COMPARED = 1024  # touched taxels that are compared with their neighbours in one frame
+_PLAIN = 24.0  # times the noise: weaker touches do not show whether two taxels are the same
+_STEADY = 0.25  # share of a jump: neighbours that change less have not felt it
+_STILL_FRAMES = 5  # frames without a large change before a value is lost: noise is large in each
+_BACK = 0.2  # share of a jump: the value is back if it differs by less from the one before
+_LOST_S = 2.0  # seconds: what lasts longer is no dropout
+_FORGET_S = 600.0  # seconds in which half of the dropouts are forgotten
+_CHANGE_S = 0.4  # seconds between values that are compared: a slow stroke changes little from one frame to the next
+_BELOW = 0.8  # part of its value that another must show, where a taxel seems to be touched alone
+_MOST_SHARE = 1.25  # part of the touches of another, beyond which they are not the reason of its own
+_MOST_ALONE = 256  # taxels that are compared with all others of their modules
 
 
 def lower_median(numbers: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], Whole]:
@@ -149,7 +134,7 @@ class Exchanges:
         rank = self._rank[taxels]
         self._moment[rank[rank >= 0]] = np.maximum(above[self.taxels], 0)
 
-    def end(self, taxels: Whole, due: npt.NDArray[np.float64]) -> None:
+    def end(self, taxels: Whole, due: Doubles) -> None:
         """End the touches of some taxels, to which so much was due."""
         rank = self._rank[taxels]
         rank, due = rank[rank >= 0], due[rank >= 0]
@@ -217,7 +202,7 @@ class Copies:
         for taxel in watched[steady & usable[watched]].tolist():
             self._alone[taxel].add(now_s, float(change[taxel]), change, clear)
 
-    def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, npt.NDArray[np.float64]]:
+    def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, Doubles]:
         """Find taxels that show a part of the touches of others.
 
         Args:

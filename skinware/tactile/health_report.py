@@ -10,8 +10,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
+from skinware.tactile.arrays import Bytes, Flags, Floats
 
 
 class HealthKind(enum.IntEnum):
@@ -65,7 +64,7 @@ class HealthReport:
         other_shown: (n,) float32, the part of them that it shows.
     """
 
-    kind: npt.NDArray[np.uint8]
+    kind: Bytes
     value: Floats
     still_s: Floats
     peak: Floats

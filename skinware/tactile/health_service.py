@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.structure import Structure
+from skinware.tactile.arrays import Flags
 from skinware.tactile.baseline_stage import BaselineStage
 from skinware.tactile.chain import Chain, ChainState
 from skinware.tactile.health import Health
@@ -204,7 +205,7 @@ class ChainHealth:
                     known = state.health[name]
                     health.restore(known, self._chain.rows_of(name, known["uid"]))
 
-    def faulty(self, reports: dict[str, HealthReport]) -> npt.NDArray[np.bool_]:
+    def faulty(self, reports: dict[str, HealthReport]) -> Flags:
         """Return (n_sensors,) bool: the sensors of the driver that have a fault in ``reports``."""
         found = np.zeros(self._chain.structure.n_sensors, bool)
         for name, report in reports.items():

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import Index
+from skinware.tactile.arrays import Doubles, Floats
 from skinware.tactile.contacts import ContactSet
 
 
@@ -34,12 +35,12 @@ class RegionMotion:
     name: str
     load: float
     contacts: int
-    velocity_m_s: npt.NDArray[np.float32]
+    velocity_m_s: Floats
     speed_m_s: float
     frame: str
 
     @property
-    def direction(self) -> npt.NDArray[np.float32]:
+    def direction(self) -> Floats:
         """(3,) of length 1; NaN where nothing moves."""
         length = np.float32(self.speed_m_s if self.speed_m_s > 0 else np.nan)
         return self.velocity_m_s / length
@@ -60,10 +61,10 @@ class MotionSet:
     """
 
     names: tuple[str, ...]
-    load: npt.NDArray[np.float32]
+    load: Floats
     contacts: npt.NDArray[np.uint32]
-    velocity_m_s: npt.NDArray[np.float32]
-    speed_m_s: npt.NDArray[np.float32]
+    velocity_m_s: Floats
+    speed_m_s: Floats
     frame: npt.NDArray[np.int16]
     frames: tuple[str, ...]
 
@@ -122,7 +123,7 @@ def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDA
     return MotionSet(names=tuple(regions), frames=contacts.frames, **found)
 
 
-def _velocity(contacts: ContactSet, load: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], int]:
+def _velocity(contacts: ContactSet, load: Doubles) -> tuple[Doubles, int]:
     moving = np.flatnonzero((load > 0) & (contacts.frame >= 0))
     if not len(moving):
         return np.full(3, np.nan), -1

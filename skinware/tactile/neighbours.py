@@ -11,16 +11,14 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
+from skinware.tactile.arrays import Doubles, Flags, Whole
 
 NONE = -1
 """Fills up the rows of a table."""
 
-_REACH = 1.8
-"""Pitches within which taxels are neighbours: two rings of a lattice of squares or triangles."""
-_OPPOSITE = -0.2
-"""Scalar product of two normals below which their taxels lie on different sides of a thin part."""
-_MOST_AT_ONE_PLACE = 32
-"""Taxels at one place: files give a place to more of them only where their places are not known."""
+_REACH = 1.8  # pitches within which taxels are neighbours: two rings of a lattice of squares or triangles
+_OPPOSITE = -0.2  # scalar product of two normals below which their taxels lie on different sides of a thin part
+_MOST_AT_ONE_PLACE = 32  # taxels at one place: files give a place to more of them only where their places are not known
 _MOST_CANDIDATES = 10_000_000
 _MOST_CELLS = 1 << 62
 _PITCH_SAMPLE = 128
@@ -101,7 +99,7 @@ def neighbours_of_pairs(pairs: npt.ArrayLike, n: int) -> Table:
     return _table(one[one != other], other[one != other], n)
 
 
-def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
+def pitch_m(geometry: Geometry) -> Doubles:
     """Return (n,) m the pitch of each taxel's frame, the median distance from a place to the nearest other on its side.
 
     NaN where the place is not known, or is the only one of its frame.
@@ -124,7 +122,7 @@ def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
     return pitch
 
 
-def area_m2(geometry: Geometry) -> npt.NDArray[np.float64]:
+def area_m2(geometry: Geometry) -> Doubles:
     """Return (n,) m2 the area of skin that each taxel stands for, an estimate from the pitch of its frame.
 
     A frame counts as a lattice of triangles if enough places have five or more others at the pitch, else as one of
@@ -153,7 +151,7 @@ def area_m2(geometry: Geometry) -> npt.NDArray[np.float64]:
     return area
 
 
-def _placed(geometry: Geometry) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _placed(geometry: Geometry) -> tuple[Whole, Whole]:
     rows = np.flatnonzero(np.isfinite(geometry.position_m).all(axis=1))
     _, frame = np.unique(geometry.frame[rows].astype(str), return_inverse=True)
     if not len(rows):
@@ -165,17 +163,13 @@ def _placed(geometry: Geometry) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.i
     return rows[own], frame[own]
 
 
-def _on_one_side(
-    normal: npt.NDArray[np.float64], one: npt.NDArray[np.int64], other: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _on_one_side(normal: Doubles, one: Whole, other: Whole) -> tuple[Whole, Whole]:
     """The pairs that do not lie on opposite sides of a part, as far as their normals are known."""
     opposite = np.einsum("ij,ij->i", normal[one], normal[other]) < _OPPOSITE
     return one[~opposite], other[~opposite]
 
 
-def _pairs_within_1(
-    frame: npt.NDArray[np.int64], places: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _pairs_within_1(frame: Whole, places: Doubles) -> tuple[Whole, Whole]:
     """All pairs of rows of one frame whose places are at most 1 apart, each pair once.
 
     Places are sorted into cells of side 1. The keys of the cells along z follow each other, so that one search finds
@@ -207,7 +201,7 @@ def _pairs_within_1(
     return one[near], other[near]
 
 
-def _table(one: npt.NDArray[np.int64], other: npt.NDArray[np.int64], n: int) -> Table:
+def _table(one: Whole, other: Whole, n: int) -> Table:
     """The table of pairs, each given at least once in one direction."""
     pairs = np.sort(np.concatenate([one * n + other, other * n + one]))  # np.unique sorts ten times as long
     pairs = pairs[np.diff(pairs, prepend=-1) > 0]
@@ -215,7 +209,7 @@ def _table(one: npt.NDArray[np.int64], other: npt.NDArray[np.int64], n: int) -> 
     return _filled(row, neighbour, n)
 
 
-def _filled(row: npt.NDArray[np.int64], number: npt.NDArray[np.integer], n: int) -> Table:
+def _filled(row: Whole, number: npt.NDArray[np.integer], n: int) -> Table:
     """A table with numbers in n rows, given row by row."""
     count = np.bincount(row, minlength=n)
     table = np.full((n, int(count.max(initial=0))), NONE, np.int32)
@@ -235,9 +229,6 @@ def checked(table: npt.NDArray[Any], n: int) -> Table:
         )
     row, column = np.nonzero(table != NONE)
     return neighbours_of_pairs(np.column_stack([row, table[row, column].astype(np.int64)]), n)
-
-
-Rows = npt.NDArray[np.int64]
 
 
 class Components:
@@ -261,7 +252,7 @@ class Components:
         self._module = module if self._is_lonely.any() else None
         self._position = np.full(n + 1, NONE, np.int32)  # among those that are touched; the last one is that of NONE
 
-    def of(self, touched: Rows) -> tuple[Rows, int]:
+    def of(self, touched: Whole) -> tuple[Whole, int]:
         """Return (m,) int64 the component of each of m touched taxels, counted from 0 in their order; and their number.
 
         Args:
@@ -282,7 +273,7 @@ class Components:
         return number[root], int(is_root.sum())
 
 
-def _roots(count: int, low: Rows, high: Rows) -> Rows:
+def _roots(count: int, low: Whole, high: Whole) -> Whole:
     """(count,) int64: the smallest member of the component of each, for edges from ``low`` to higher numbers."""
     root = np.arange(count)
     while len(low):
@@ -296,7 +287,7 @@ def _roots(count: int, low: Rows, high: Rows) -> Rows:
     return root
 
 
-def without_holes(touched: npt.NDArray[np.bool_], neighbours: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
+def without_holes(touched: Flags, neighbours: npt.NDArray[Any]) -> Flags:
     """Return (n,) bool the touched taxels and their holes: taxels most of whose neighbours are among them.
 
     At the edge of a skin taxels have few neighbours. There, the number of such neighbours must be more than half of the

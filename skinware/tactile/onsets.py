@@ -15,22 +15,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
+from skinware.tactile.arrays import Flags, Floats
 
 if TYPE_CHECKING:
     from skinware.tactile.contacts import Contact, ContactSet
 
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 
-_ABOVE_SIGMA = 5.0
-"""Standard deviations of its noise by which a taxel must be above its baseline."""
-_ENOUGH, _FRAMES = 2, 3
-"""In how many of the last frames."""
-_GONE_S = 0.08
-"""Seconds after which a contact that is missing has ended: longer than its identity is kept."""
+_ABOVE_SIGMA = 5.0  # standard deviations of its noise by which a taxel must be above its baseline
+_ENOUGH, _FRAMES = 2, 3  # in how many of the last frames
+_GONE_S = 0.08  # seconds after which a contact that is missing has ended: longer than its identity is kept
 
 
 class Onsets:

@@ -11,17 +11,16 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from skinware._columns import Index, as_index, texts
 from skinware.errors import ConfigurationError
 from skinware.geometry import Triple
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
+from skinware.tactile.arrays import Flags
 from skinware.toml_text import TomlText, line_of
 
 _SELECTORS = ("uid", "patch", "module", "frame", "box", "regions")
-Flags = npt.NDArray[np.bool_]
 
 
 class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -26,10 +26,8 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
+from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
 from skinware.tactile.rule import SIGNED_TYPES, resolution_of
-
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 
 NO_UNIT = "1"
 """Unit of values that are no quantity any more."""
@@ -84,8 +82,8 @@ class Taxels:
 
     type: SensorType
     uid: npt.NDArray[np.uint64]
-    module: npt.NDArray[np.int64]
-    patch: npt.NDArray[np.int64]
+    module: Whole
+    patch: Whole
     resolution: float = 0.0
     signed: bool = False
     common: bool = True
@@ -131,12 +129,12 @@ class Stage(ABC):
         before_ns, self._time_ns = self._time_ns, signal.time_ns
         return 0.0 if before_ns is None else max(0, signal.time_ns - before_ns) / NS_PER_S
 
-    def state(self) -> dict[str, npt.NDArray[np.float64]]:
+    def state(self) -> dict[str, Doubles]:
         """Return what baselines behind it need after a restart: arrays (n,) by name, copies."""
         return {}
 
     def restore(  # noqa: B027
-        self, state: Mapping[str, npt.NDArray[np.float64]], rows: npt.NDArray[np.integer]
+        self, state: Mapping[str, Doubles], rows: npt.NDArray[np.integer]
     ) -> None:
         """Go on with the state of another stage: (n,) ``rows`` say where each taxel stands there; -1: nowhere.
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles
 from skinware.tactile.curves import TEMPERATURE
 from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxels
 
@@ -22,8 +23,7 @@ SMOOTH_S = 0.5
 """Time constant of the temperatures in seconds: skins do not warm up faster."""
 GAIN_LASTS_S = 604800.0
 """Seconds, a week, in which a known gain becomes as uncertain as at the start: skins age."""
-_MEDIAN2 = 0.455
-"""Median of the square of a standard normal deviate."""
+_MEDIAN2 = 0.455  # median of the square of a standard normal deviate
 
 
 class ThermalSettings(StageSettings, frozen=True, kw_only=True, tag="thermal"):
@@ -61,15 +61,15 @@ class ThermalGains:
 
     def __init__(self, patch: npt.NDArray[np.integer], spread: float) -> None:
         n = len(patch)
-        self.gain: npt.NDArray[np.float64] = np.zeros(n)
+        self.gain: Doubles = np.zeros(n)
         self._patch, self._spread2 = patch, spread**2
-        self.own: npt.NDArray[np.float64] = np.zeros(n)
-        self.variance: npt.NDArray[np.float64] = np.full(n, self._spread2)
+        self.own: Doubles = np.zeros(n)
+        self.variance: Doubles = np.full(n, self._spread2)
         self._noise2 = np.full(int(patch.max(initial=-1)) + 1, np.nan)
         self._noisier = np.ones(n)
         self._means = np.full((2, n), np.nan)
 
-    def learn(self, values: npt.NDArray[np.float64], warmth: npt.NDArray[np.float64]) -> None:
+    def learn(self, values: Doubles, warmth: Doubles) -> None:
         """Take in the means of the next window.
 
         Args:
@@ -124,12 +124,12 @@ class ThermalStage(Stage):
         """Over a window of time: of the values of taxels and their numbers, and of the temperatures of modules."""
         self._frames, self._window_s = 0, 0.0
 
-    def state(self) -> dict[str, npt.NDArray[np.float64]]:
+    def state(self) -> dict[str, Doubles]:
         warmth = self._warmth[self.taxels.module]
         own, variance = self.gains.own.copy(), self.gains.variance.copy()
         return {"drift": self._drift.copy(), "warmth": warmth, "own": own, "variance": variance}
 
-    def restore(self, state: Mapping[str, npt.NDArray[np.float64]], rows: npt.NDArray[np.integer]) -> None:
+    def restore(self, state: Mapping[str, Doubles], rows: npt.NDArray[np.integer]) -> None:
         here, m = np.flatnonzero(rows >= 0), int(rows.max(initial=-1)) + 1
         for name in ("drift", "warmth", "own", "variance"):
             given = state.get(name)

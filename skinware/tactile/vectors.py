@@ -18,8 +18,9 @@ import numpy.typing as npt
 from skinware import native
 from skinware.errors import ConfigurationError
 from skinware.native import give_arrays, read_structs
+from skinware.tactile.arrays import Doubles, Flags, Floats
 from skinware.tactile.rule import FORGET_AFTER_S
-from skinware.tactile.stages import Floats, Positive, Signal, Stage, StageSettings, Taxels
+from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxels
 
 AXES = (
     ("magnetic_field_x", "magnetic_field_y", "magnetic_field_z"),
@@ -31,8 +32,7 @@ LEAST_ARRAY = 4
 """Taxels of a patch that it takes to know a touch from a field."""
 
 _STRUCTS = read_structs([Path(native.__file__).with_name("field.h")])
-_NUMBERS = {"response": 12, "covariance": 16, "load": 3, "rest": 3}
-"""Numbers of a taxel, where there are several."""
+_NUMBERS = {"response": 12, "covariance": 16, "load": 3, "rest": 3}  # numbers of a taxel, where there are several
 
 _update = native.core().quick.skinware_field_update
 _update.argtypes, _update.restype = (*(ctypes.c_void_p,) * 3, ctypes.c_double, ctypes.c_void_p), None
@@ -76,19 +76,17 @@ class ArrayField:
         return len(self._memory)
 
     @property
-    def now(self) -> npt.NDArray[np.float64]:
+    def now(self) -> Doubles:
         """(arrays, 3) the change of the field at each array since its first frame; a copy."""
         return np.array([list(array.field) for array in self._memory]).reshape(-1, 3)
 
     @property
-    def bears(self) -> npt.NDArray[np.bool_]:
+    def bears(self) -> Flags:
         """(n,) bool, which taxels bear a load in the newest frame; a copy."""
-        bears: npt.NDArray[np.bool_] = self._arrays["bears"].copy()
+        bears: Flags = self._arrays["bears"].copy()
         return bears
 
-    def update(
-        self, values: Floats, usable: npt.NDArray[np.bool_], passed_s: float
-    ) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    def update(self, values: Floats, usable: Flags, passed_s: float) -> tuple[Floats, Flags]:
         """Take in the next frame.
 
         Args:

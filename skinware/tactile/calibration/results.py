@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.geometry import GeometryGroup
 from skinware.structure import Structure
+from skinware.tactile.arrays import Doubles, Flags, Whole
 from skinware.tactile.calibration.placing import Placement
 from skinware.tactile.calibration.topology import Topology, unrolled_m
-
-ArrayF = npt.NDArray[np.float64]
 
 _DIGITS = 6
 
 
-def confidence_of(error_m: ArrayF, pitch_m: float) -> float:
+def confidence_of(error_m: Doubles, pitch_m: float) -> float:
     """Return the share of sensors within half a pitch of their places, if errors along the skin are normal.
 
     Args:
@@ -104,9 +102,7 @@ def unrolled_comment(topology: Topology) -> str:
     )
 
 
-def _by_module(
-    structure: Structure, type_name: str, wanted: npt.NDArray[np.bool_]
-) -> list[tuple[int, npt.NDArray[np.int64]]]:
+def _by_module(structure: Structure, type_name: str, wanted: Flags) -> list[tuple[int, Whole]]:
     module = structure.module_of(type_name)
     return [(number, np.flatnonzero(wanted & (module == number))) for number in np.unique(module[wanted]).tolist()]
 
@@ -115,9 +111,9 @@ def _group(
     structure: Structure,
     type_name: str,
     module: int,
-    rows: npt.NDArray[np.int64],
-    position_m: ArrayF,
-    normal: ArrayF,
+    rows: Whole,
+    position_m: Doubles,
+    normal: Doubles,
     frame: str,
     confidence: float | None = None,
 ) -> GeometryGroup:

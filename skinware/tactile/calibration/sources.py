@@ -6,18 +6,16 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, Overrun, ServiceTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 from skinware.structure import Structure
+from skinware.tactile.arrays import Doubles
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.curves import temperature_of
 from skinware.tactile.rule import UNUSABLE
-
-ArrayF = npt.NDArray[np.float64]
 
 POINT, POSE = "point_m", "pose"
 """Columns of a service of poses: (3,) or (k, 3) points, m; (4, 4) pose of the carrier of a finger, homogeneous, m."""
@@ -72,7 +70,7 @@ class LoadSource:
         """Share of the sensors that have no baseline yet because they move."""
         return 0.0 if self._chain is None else self._chain.baselines[self.type_name].refused_share
 
-    def loads(self, frame: DriverSnapshot) -> ArrayF:
+    def loads(self, frame: DriverSnapshot) -> Doubles:
         """Return (n,) the loads in a frame; NaN where they are not known."""
         if self._chain is None:
             values, status = frame.physical(self.type_name), frame.status_of(self.type_name)
@@ -81,7 +79,7 @@ class LoadSource:
             values, status = self._values[self._index], self._status[self._index]
         self.temperature_c = temperature_of(frame)
         usable = (status & np.uint8(UNUSABLE)) == 0
-        loads: ArrayF = np.where(usable, values, np.nan).astype(np.float64)
+        loads: Doubles = np.where(usable, values, np.nan).astype(np.float64)
         return loads
 
 
@@ -110,7 +108,7 @@ class PoseSource:
             raise ConfigurationError(f"column {column!r} of {reader.name!r} is {found}; give {shape}, of floats")
         self._reader, self._column, self._shape = reader, column, shape
 
-    def newest(self) -> ArrayF | None:
+    def newest(self) -> Doubles | None:
         """Return the present pose; None if it is older than 0.2 s, or there is none."""
         try:
             frame = self._reader.read(timeout_s=0)
@@ -121,7 +119,7 @@ class PoseSource:
         if self._has_count and int(np.asarray(frame.column(_COUNT)).reshape(-1)[0]) != 1:
             return None
         rows = np.asarray(frame.column(self._column), np.float64).reshape(-1, *self._shape)
-        pose: ArrayF = rows[0].copy()
+        pose: Doubles = rows[0].copy()
         return pose
 
 
@@ -140,7 +138,7 @@ class ForceSource:
         self._source, self._reference = source, reference
         self.weight_n = math.nan
 
-    def newest(self) -> ArrayF | None:
+    def newest(self) -> Doubles | None:
         """Return (2,) the present force and temperature, NaN where not known; None without a force."""
         force = np.array([self.weight_n]) if self._reference is None else self._reference.newest()
         if force is None:

@@ -12,12 +12,10 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
-from skinware.tactile.array_file import Arrays, read_arrays, write_arrays
+from skinware.tactile.arrays import Arrays, Doubles, read_arrays, write_arrays
 from skinware.tactile.calibration.force import ForceData
 from skinware.tactile.calibration.placing import Press, Presses
 from skinware.tactile.calibration.topology import ENOUGH_FRAMES, StrokeSums
-
-ArrayF = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,12 +44,12 @@ class PressFinder:
 
     settings: PressSettings = field(default_factory=PressSettings)
     held: bool = False
-    _window: list[tuple[int, ArrayF, ArrayF]] = field(default_factory=list)
-    _found_at_m: ArrayF = field(default_factory=lambda: np.full(3, np.nan))
-    _passed_m: list[ArrayF] = field(default_factory=list)
+    _window: list[tuple[int, Doubles, Doubles]] = field(default_factory=list)
+    _found_at_m: Doubles = field(default_factory=lambda: np.full(3, np.nan))
+    _passed_m: list[Doubles] = field(default_factory=list)
     """The last two points of its way that are apart by more than it may move while it rests."""
 
-    def update(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> Press | None:
+    def update(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> Press | None:
         """Take a frame, and return the press that is complete with it.
 
         Args:
@@ -92,16 +90,16 @@ class PressFinder:
         taxel = np.flatnonzero(mean > 0)
         return Press(at, taxel, mean[taxel], motion)
 
-    def _follow(self, pose: ArrayF | None) -> None:
+    def _follow(self, pose: Doubles | None) -> None:
         if pose is None or not np.isfinite(pose).all():
             self._passed_m.clear()
         elif not self._passed_m or np.linalg.norm(_point(pose) - self._passed_m[-1]) > self.settings.still_m:
             self._passed_m = [*self._passed_m[-1:], _point(pose).copy()]
 
 
-def _point(pose: ArrayF) -> ArrayF:
+def _point(pose: Doubles) -> Doubles:
     """(3,) the point, or the origin of the pose."""
-    point: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
+    point: Doubles = pose if pose.ndim == 1 else pose[:3, 3]
     return point
 
 
@@ -115,7 +113,7 @@ class Session(ABC):
     kind: str
 
     @abstractmethod
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
         """Take a frame.
 
         Args:
@@ -126,7 +124,7 @@ class Session(ABC):
 
     @property
     @abstractmethod
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         """(n,) 0 to 1: how complete each taxel is."""
 
     @property
@@ -176,13 +174,13 @@ class PressSession(Session):
         self._finder = PressFinder(settings or PressSettings())
         self.presses = Presses.none(n, pose_shape)
 
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
         press = self._finder.update(time_ns, load, pose)
         if press is not None:
             self.presses = self.presses.with_press(press)
 
     @property
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         return np.minimum(self.presses.times_pressed / self._wanted, 1.0)
 
     @property
@@ -214,12 +212,12 @@ class StrokeSession(Session):
     def __init__(self, n: int) -> None:
         self.sums = StrokeSums.empty(n)
 
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
         del time_ns, pose  # strokes need neither
         self.sums.add(load)
 
     @property
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         return np.minimum(self.sums.active / ENOUGH_FRAMES, 1.0)
 
     @property
@@ -255,9 +253,9 @@ class ForceSession(Session):
 
     def __init__(self, n: int) -> None:
         self._n = n
-        self._frames: list[tuple[float, ArrayF, ArrayF]] = []
+        self._frames: list[tuple[float, Doubles, Doubles]] = []
 
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
         if pose is not None and np.isfinite(pose[0]):
             self._frames.append((time_ns / NS_PER_S, np.nan_to_num(load), pose))
 
@@ -269,7 +267,7 @@ class ForceSession(Session):
         return ForceData(np.array([time_s for time_s, *_ in self._frames]), loads, force_n, temperature_c)
 
     @property
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         pressed = np.zeros(self._n)
         for _, load, _ in self._frames:
             pressed += load > 0

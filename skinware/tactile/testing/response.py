@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
+from skinware.tactile.arrays import Doubles, Flags, Whole
 
-ArrayF = npt.NDArray[np.float64]
-_FAR = 5.0
-"""Widths beyond which nothing is felt."""
+_FAR = 5.0  # widths beyond which nothing is felt
 
 
 @dataclass(frozen=True)
@@ -48,19 +46,19 @@ class Response:
         """Distance from a contact beyond which nothing changes, m."""
         return _FAR * self.width_m if self.sag == 0 else max(_FAR * self.width_m, 4 * self.sag_radius_m)
 
-    def bell(self, distance_m: ArrayF) -> ArrayF:
+    def bell(self, distance_m: Doubles) -> Doubles:
         """Return the share of the force that is felt as load, at distances; 0 at NaN."""
         near = distance_m <= _FAR * self.width_m
-        load: ArrayF = np.where(near, np.exp(-0.5 * (np.where(near, distance_m, 0) / self.width_m) ** 2), 0.0)
+        load: Doubles = np.where(near, np.exp(-0.5 * (np.where(near, distance_m, 0) / self.width_m) ** 2), 0.0)
         return load
 
-    def ring(self, distance_m: ArrayF) -> ArrayF:
+    def ring(self, distance_m: Doubles) -> Doubles:
         """Return the share of the force that is missing round it, at distances; 0 at NaN."""
         squared = np.where(distance_m <= 4 * self.sag_radius_m, distance_m / self.sag_radius_m, 0) ** 2
-        missing: ArrayF = self.sag * squared * np.exp(1 - squared)
+        missing: Doubles = self.sag * squared * np.exp(1 - squared)
         return missing
 
-    def slowly(self, load: ArrayF, crept: ArrayF, period_s: float) -> ArrayF:
+    def slowly(self, load: Doubles, crept: Doubles, period_s: float) -> Doubles:
         """Return what creep and remainder add to a block of loads.
 
         Args:
@@ -79,9 +77,6 @@ class Response:
         return self.creep * np.minimum(used_to, load) + self.remainder * np.maximum(used_to - load, 0)
 
 
-ArrayI = npt.NDArray[np.int64]
-
-
 @dataclass(frozen=True)
 class Missing:
     """Taxels without data for a while.
@@ -94,7 +89,7 @@ class Missing:
         value: value in their place; None: the last one (before the first frame: 0).
     """
 
-    taxels: ArrayI
+    taxels: Whole
     begin_s: float
     end_s: float
     status: Status
@@ -112,7 +107,7 @@ class Jump:
         suspect_s: for how long their status is ``SUSPECT``; 0 if the driver does not notice.
     """
 
-    taxels: ArrayI
+    taxels: Whole
     counts: float
     at_s: float
     suspect_s: float
@@ -131,10 +126,10 @@ class Faults:
         jumps: jumps.
     """
 
-    feels: npt.NDArray[np.bool_]
-    noise: ArrayF
-    stuck: ArrayF
-    source: ArrayI
+    feels: Flags
+    noise: Doubles
+    stuck: Doubles
+    source: Whole
     missing: list[Missing] = field(default_factory=list)
     jumps: list[Jump] = field(default_factory=list)
 
@@ -142,7 +137,7 @@ class Faults:
     def none(cls, n: int) -> Faults:
         return cls(np.ones(n, bool), np.ones(n), np.full(n, np.nan), np.arange(n))
 
-    def jumped(self, time_s: ArrayF, patch: ArrayI) -> tuple[ArrayF | None, npt.NDArray[np.bool_] | None]:
+    def jumped(self, time_s: Doubles, patch: Whole) -> tuple[Doubles | None, Flags | None]:
         """Return (m, n) what jumps add to the values, and (m, n) which are suspect; None if there is no jump yet.
 
         Args:

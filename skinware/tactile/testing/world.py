@@ -11,12 +11,11 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
+from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole
 from skinware.tactile.rule import UNUSABLE
 from skinware.tactile.testing.gestures import Cover, Gesture, How, Push, Stroke
 from skinware.tactile.testing.response import Faults, Jump, Missing, Response
 from skinware.tactile.testing.surface import Surface, Taxels
-
-ArrayF = npt.NDArray[np.float64]
 
 _START_NS = 1_000_000_000
 _ROWS = 2048
@@ -35,11 +34,11 @@ class Block:
         truth: (m, n) float32, the load in counts, without drift, noise, sag, creep and faults. It does not clip.
     """
 
-    time_ns: npt.NDArray[np.int64]
-    module_time_ns: npt.NDArray[np.int64]
+    time_ns: Whole
+    module_time_ns: Whole
     values: npt.NDArray[np.generic]
-    status: npt.NDArray[np.uint8]
-    truth: npt.NDArray[np.float32]
+    status: Bytes
+    truth: Floats
 
     @classmethod
     def joined(cls, blocks: Sequence[Block]) -> Block:
@@ -57,9 +56,9 @@ class Block:
         return len(self.time_ns)
 
     @property
-    def usable(self) -> npt.NDArray[np.bool_]:
+    def usable(self) -> Flags:
         """(m, n) bool: there is a value, and it is of this frame."""
-        usable: npt.NDArray[np.bool_] = (self.status & np.uint8(UNUSABLE)) == 0
+        usable: Flags = (self.status & np.uint8(UNUSABLE)) == 0
         return usable
 
     def __iter__(self) -> Iterator[Sample]:
@@ -80,11 +79,11 @@ class Sample:
     """One frame, a row of a :class:`Block`: its arrays are (n,) and (n_modules,)."""
 
     time_ns: int
-    module_time_ns: npt.NDArray[np.int64]
+    module_time_ns: Whole
     values: npt.NDArray[np.generic]
-    status: npt.NDArray[np.uint8]
-    usable: npt.NDArray[np.bool_]
-    truth: npt.NDArray[np.float32]
+    status: Bytes
+    usable: Flags
+    truth: Floats
 
 
 @dataclass
@@ -143,13 +142,11 @@ class World:
     dtype: npt.DTypeLike = np.uint8
     gestures: list[Gesture] = field(default_factory=list, init=False)
     faults: Faults = field(init=False)
-    gain: ArrayF = field(init=False)
-    follows: ArrayF = field(init=False)
-    wave_phase: ArrayF = field(init=False)
-    late_s: ArrayF = field(init=False)
-    _known_near: dict[tuple[Gesture, float], npt.NDArray[np.bool_]] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    gain: Doubles = field(init=False)
+    follows: Doubles = field(init=False)
+    wave_phase: Doubles = field(init=False)
+    late_s: Doubles = field(init=False)
+    _known_near: dict[tuple[Gesture, float], Flags] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not len(self.surface):
@@ -199,7 +196,7 @@ class World:
         self.gestures.append(cover)
         return cover
 
-    def pressing(self, time_s: float) -> list[tuple[Gesture, ArrayF, float]]:
+    def pressing(self, time_s: float) -> list[tuple[Gesture, Doubles, float]]:
         """Return the gestures that press at a time, each with its place (3,) and its force."""
         at = np.array([time_s])
         found = [(gesture, gesture.points_m(at)[0], float(gesture.forces(at)[0])) for gesture in self.gestures]
@@ -278,7 +275,7 @@ class World:
         for first in range(0, total, rows):
             yield state.next_block(first, min(rows, total - first))
 
-    def loads(self, time_s: ArrayF) -> tuple[ArrayF, ArrayF]:
+    def loads(self, time_s: Doubles) -> tuple[Doubles, Doubles]:
         """Return the load of all gestures together, in counts.
 
         Args:
@@ -303,7 +300,7 @@ class World:
                     missing[rows, taxels] += sagged
         return load, missing
 
-    def felt(self, time_s: ArrayF, taxels: Taxels) -> ArrayF:
+    def felt(self, time_s: Doubles, taxels: Taxels) -> Doubles:
         """Return what taxels feel of all gestures at given times, in counts: the load less the sag.
 
         It is for programs that make frames with times and noise of their own.
@@ -325,7 +322,7 @@ class World:
         total *= self.faults.feels[numbers]
         return total
 
-    def _near(self, gesture: Gesture) -> npt.NDArray[np.bool_]:
+    def _near(self, gesture: Gesture) -> Flags:
         key = gesture, self.response.reach_m
         near = self._known_near.get(key)
         if near is None:
@@ -334,7 +331,7 @@ class World:
             near = self._known_near[key] = gesture.least_distances_m(self.surface) <= self.response.reach_m
         return near
 
-    def _felt(self, gesture: Gesture, time_s: ArrayF, taxels: npt.NDArray[np.int64]) -> tuple[ArrayF, ArrayF]:
+    def _felt(self, gesture: Gesture, time_s: Doubles, taxels: Whole) -> tuple[Doubles, Doubles]:
         force = self.sensitivity * gesture.forces(time_s)[:, np.newaxis] * self.gain[taxels]
         distance = gesture.distances_m(time_s, self.surface, taxels)
         load = force * self.response.bell(distance)
@@ -377,10 +374,10 @@ class _State:
         of_patch[surface.module] = surface.patch
         return Block(time_ns.max(axis=1), time_ns[:, of_patch], values, status, load.astype(np.float32))
 
-    def _signal(self, time_s: ArrayF, load: ArrayF) -> ArrayF:
+    def _signal(self, time_s: Doubles, load: Doubles) -> Doubles:
         world, faults = self._world, self._world.faults
         m, n = load.shape
-        signal: ArrayF = self._noise.standard_normal((m, n), np.float32) * (world.noise * faults.noise)
+        signal: Doubles = self._noise.standard_normal((m, n), np.float32) * (world.noise * faults.noise)
         felt = load * faults.feels
         signal += felt
         if world.response.creep or world.response.remainder:
@@ -401,7 +398,7 @@ class _State:
             signal += walked
         return signal
 
-    def _values(self, signal: ArrayF) -> npt.NDArray[np.generic]:
+    def _values(self, signal: Doubles) -> npt.NDArray[np.generic]:
         world, faults = self._world, self._world.faults
         signal += world.idle
         if world.step:
@@ -415,7 +412,7 @@ class _State:
             values = values[:, faults.source]
         return values
 
-    def _leave_out(self, time_s: ArrayF, values: npt.NDArray[np.generic], status: npt.NDArray[np.uint8]) -> None:
+    def _leave_out(self, time_s: Doubles, values: npt.NDArray[np.generic], status: Bytes) -> None:
         for gap in self._world.faults.missing:
             gone = (time_s >= gap.begin_s) & (time_s < gap.end_s)
             for patch in np.flatnonzero(gone.any(axis=0)).tolist():

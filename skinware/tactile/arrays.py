@@ -1,10 +1,11 @@
-"""Keep named arrays in a file."""
+"""Name the arrays of this package by what they hold, keep them in files, and check those that are given back."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +14,18 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 
+Floats = npt.NDArray[np.float32]
+Doubles = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+Whole = npt.NDArray[np.int64]
+Bytes = npt.NDArray[np.uint8]
 Arrays = dict[str, npt.NDArray[Any]]
+
 _VERSION = "version"
 
 
 def write_arrays(path: Path, version: int, arrays: Arrays) -> None:
-    """Write the file in one step: programs see the new file or the one before, never a part of it.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a file in one step: programs see the new file or the one before, never a part of it; raises OSError."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with draft.open("wb") as file:
@@ -51,3 +54,13 @@ def read_arrays(path: Path, version: int) -> Arrays | None:
     if found != version:
         raise ConfigurationError(f"{path} is of another version")
     return arrays
+
+
+def check_state(of: str, state: Mapping[str, npt.NDArray[Any]], own: Arrays, rows: npt.NDArray[np.integer]) -> None:
+    """Check that a state has arrays like a stage's own, with all rows that are read; raises ConfigurationError."""
+    least = int(rows.max(initial=-1)) + 1
+    for name, array in own.items():
+        given = state.get(name)
+        is_like = given is not None and given.ndim == array.ndim and given.shape[1:] == array.shape[1:]
+        if given is None or not is_like or given.dtype != array.dtype or len(given) < least:
+            raise ConfigurationError(f"no state of {of}: {name} is missing or has a wrong shape or dtype")

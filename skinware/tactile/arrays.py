@@ -20,6 +20,8 @@ Flags = npt.NDArray[np.bool_]
 Whole = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
 Arrays = dict[str, npt.NDArray[Any]]
+Columns = dict[str, tuple[str, tuple[int, ...], str | None, str]]
+"""Columns of a service: dtype, shape, unit (None: that of the values) and meaning of each."""
 
 _VERSION = "version"
 
@@ -54,6 +56,16 @@ def read_arrays(path: Path, version: int) -> Arrays | None:
     if found != version:
         raise ConfigurationError(f"{path} is of another version")
     return arrays
+
+
+def part_of(arrays: Arrays, begin: str) -> Arrays:
+    """Return the arrays whose names begin in this way, without that beginning."""
+    return {name.removeprefix(begin): array for name, array in arrays.items() if name.startswith(begin)}
+
+
+def rows_of(columns: Columns, n: int) -> Columns:
+    """Return these columns with n rows each."""
+    return {name: (dtype, (n, *shape), unit, text) for name, (dtype, shape, unit, text) in columns.items()}
 
 
 def check_state(of: str, state: Mapping[str, npt.NDArray[Any]], own: Arrays, rows: npt.NDArray[np.integer]) -> None:

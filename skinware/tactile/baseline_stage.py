@@ -27,11 +27,6 @@ class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_fie
     types: tuple[str, ...] | None = None
 
     def stage(self, taxels: Taxels) -> BaselineStage:
-        """Make the stage for some taxels.
-
-        Raises:
-            ConfigurationError: the type has no rest to go back to.
-        """
         name, unit = taxels.type.name, taxels.type.unit
         if name.startswith(RESTLESS):
             raise ConfigurationError(f"a {name} has no rest to return to")

@@ -32,7 +32,7 @@ and ``vector`` behind it are for taxels with three axes: see skinware.tactile.ve
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -44,7 +44,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.arrays import Bytes, Flags, Floats
+from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.baseline_stage import RESTLESS, BaselineStage, BaselineStageSettings
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
@@ -154,12 +154,16 @@ _WHY_NO_GROUPS: dict[type, str] = {
 
 
 def _groups(settings: AnySettings, taxels: Mapping[str, Taxels], wanted: Iterable[str]) -> list[tuple[str, ...]]:
-    """Return the types that a stage changes together, for each time that it is made."""
+    """The types that a stage changes together, for each time that it is made."""
     if isinstance(settings, FieldSettings | VectorSettings):
         return [names for names in vectors_of(taxels) if set(names) <= set(wanted)]
     if isinstance(settings, ThermalSettings):
         return [(name, TEMPERATURE) for name in wanted if TEMPERATURE in taxels and not name.startswith(RESTLESS)]
     return [(name,) for name in wanted]
+
+
+HEALTH = "health/"
+"""Beginning of the names of arrays of health in a state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,26 +172,28 @@ class ChainState:
 
     Attributes:
         fingerprint: of the values that its baselines saw.
-        arrays: by type, the arrays of :meth:`.Baseline.state`, and ``uid``.
-        health: by type, the arrays of :meth:`.Health.state`, and ``uid``.
+        arrays: ``TYPE/NAME`` of :meth:`.Baseline.state`, ``health/TYPE/NAME`` of :meth:`.Health.state`, and the ``uid``
+            of both.
     """
 
     fingerprint: str
-    arrays: dict[str, dict[str, npt.NDArray[Any]]]
-    health: dict[str, dict[str, npt.NDArray[Any]]] = field(default_factory=dict)
+    arrays: Arrays
+
+    def of(self, chain: Chain, type_name: str, kind: str = "") -> tuple[Arrays, npt.NDArray[np.intp]]:
+        """Return the arrays of a type, none if it has none, and (n,) the row in them of each taxel; -1: nowhere."""
+        found = part_of(self.arrays, f"{kind}{type_name}/")
+        row_of = {one: row for row, one in enumerate(found["uid"].tolist())} if found else {}
+        return found, np.array([row_of.get(one, -1) for one in chain.uid(type_name).tolist()], np.intp)
 
 
 class Chain:
     """All stages of a driver.
 
-    Args:
-        structure: structure of the driver.
-        steps: its stages in their order, each with the types that it is for.
-        taxels: by type, as they come out.
-
     Attributes:
         structure: structure of the output: the same sensors, float32, with the units of the last stages.
         stages: by type.
+        baseline_stages, curve_stages: by type, the first stage that is a baseline, and the last that is a curve.
+        vectors: the types that are axes of vectors, for each stage that shows vectors.
     """
 
     def __init__(
@@ -195,6 +201,15 @@ class Chain:
     ) -> None:
         self._steps = steps
         self.stages = {name: [stage for stage, names in steps if name in names] for name in taxels}
+        self.baseline_stages: dict[str, BaselineStage] = {}
+        self.curve_stages: dict[str, CurveStage] = {}
+        for name, stages in self.stages.items():
+            for stage in stages:
+                if isinstance(stage, BaselineStage):
+                    self.baseline_stages.setdefault(name, stage)
+                elif isinstance(stage, CurveStage):
+                    self.curve_stages[name] = stage
+        self.vectors = [names for stage, names in steps if isinstance(stage, VectorStage)]
         self._before = structure
         self._suspect: dict[str, Flags] = {}
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
@@ -202,13 +217,12 @@ class Chain:
 
     def state(self) -> ChainState:
         """Return what its baselines have learned."""
-        found = {
-            name: {"uid": self.structure.sensor_uid[self.structure.index(name)], **baseline.state()}
-            for name, baseline in self.baselines.items()
-        }
-        for name, arrays in found.items():
+        found: Arrays = {}
+        for name, baseline in self.baselines.items():
+            arrays = {"uid": self.uid(name), **baseline.state()}
             for stage in self._own_stages(name):
                 arrays |= {f"{stage.name}.{key}": array for key, array in stage.state().items()}
+            found |= {f"{name}/{key}": array for key, array in arrays.items()}
         return ChainState(self._fingerprint, found)
 
     def _own_stages(self, name: str) -> list[Stage]:
@@ -228,25 +242,20 @@ class Chain:
             return 0
         restored = 0
         for name, baseline in self.baselines.items():
-            if name in state.arrays:
-                learned = state.arrays[name]
-                rows = self.rows_of(name, learned["uid"])
+            learned, rows = state.of(self, name)
+            if learned:
                 restored += baseline.restore(learned, rows)
                 for stage in self._own_stages(name):
-                    begin = f"{stage.name}."
-                    of_stage = {key.removeprefix(begin): learned[key] for key in learned if key.startswith(begin)}
-                    stage.restore(of_stage, rows)
+                    stage.restore(part_of(learned, f"{stage.name}."), rows)
         return restored
 
     def fits(self, state: ChainState) -> bool:
-        """Return whether its baselines see the same values as those of a state did."""
+        """Whether its baselines see the same values as those of a state did."""
         return state.fingerprint == self._fingerprint
 
-    def rows_of(self, type_name: str, uid: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
-        """Return (n,) where each taxel of a type stands among some uids; -1: nowhere."""
-        row_of = {one: row for row, one in enumerate(uid.tolist())}
-        mine = self.structure.sensor_uid[self.structure.index(type_name)]
-        return np.array([row_of.get(one, -1) for one in mine.tolist()], np.intp)
+    def uid(self, type_name: str) -> npt.NDArray[np.uint64]:
+        """Return (n,) uint64, the uids of the taxels of a type."""
+        return self.structure.sensor_uid[self.structure.index(type_name)]
 
     @property
     def _fingerprint(self) -> str:
@@ -258,26 +267,6 @@ class Chain:
             unit = stages[end - 1].taxels.type.unit if end else of_driver.unit
             before.append([name, unit, of_driver.scale, of_driver.offset, kinds[:end]])
         return repr(before)
-
-    @property
-    def baseline_stages(self) -> dict[str, BaselineStage]:
-        """By type, the first stage of each that is a baseline."""
-        found: dict[str, BaselineStage] = {}
-        for name, stages in self.stages.items():
-            for stage in stages:
-                if isinstance(stage, BaselineStage):
-                    found.setdefault(name, stage)
-        return found
-
-    @property
-    def curve_stages(self) -> dict[str, CurveStage]:
-        """By type, the last stage of each that is a curve."""
-        return {name: s for name, stages in self.stages.items() for s in stages if isinstance(s, CurveStage)}
-
-    @property
-    def vectors(self) -> list[tuple[str, ...]]:
-        """The types that are axes of vectors, for each stage that shows vectors."""
-        return [names for stage, names in self._steps if isinstance(stage, VectorStage)]
 
     @property
     def baselines(self) -> dict[str, Baseline]:

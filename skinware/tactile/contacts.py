@@ -20,7 +20,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.structure import Structure
-from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole
+from skinware.tactile.arrays import Bytes, Columns, Doubles, Flags, Floats, Whole, rows_of
 from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
 from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
@@ -56,8 +56,7 @@ class Contact:
         kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
         provisional: only its last frames speak for it; the baseline has not confirmed it, and its load is 0.
         clipped: number of its taxels that are at the end of their range: load and force are too small.
-        load_whole: estimate of the load with what threshold and clipping cut off, taking it for a bell; NaN if most
-            of it is cut off.
+        load_whole: estimate of the load with what threshold and clipping cut off, as of a bell; NaN if most is cut off.
         uncertainty: how much of the load could be noise or drift, in its unit; NaN if it is not known.
         taxels: (n,) int64, positions among the n taxels, ascending.
     """
@@ -85,14 +84,10 @@ class Contact:
 class ContactSet:
     """All m contacts of one frame, the oldest first; a sequence of :class:`Contact`.
 
+    Each attribute of a contact, but for ``taxels``, has an array (m, ...) here, with the dtype of :data:`COLUMNS`.
+
     Attributes:
-        id: (m,) uint32.
-        age_s, load, peak, area_m2, force_n, load_whole, uncertainty: (m,) float32.
-        n, clipped: (m,) uint32.
-        cop_m, normal, velocity_m_s: (m, 3) float32.
         frame: (m,) int16, index into ``frames``; -1 if it is not known.
-        kind: (m,) uint8, :class:`skinware.tactile.tracking.ContactKind`.
-        provisional: (m,) uint8, 0 or 1.
         contact_of: (n,) int16, the row of the contact of each taxel; -1: none, -2: one without a row.
         beyond: number of contacts without a row.
         frames: names of the coordinate frames.
@@ -129,7 +124,7 @@ class ContactSet:
             kind=ContactKind(self.kind[row]),
             provisional=bool(self.provisional[row]),
             taxels=np.flatnonzero(self.contact_of == row),
-            **{name: getattr(self, name)[row].item() for name in ("id", *_COUNTS, *_SCALARS)},
+            **{name: getattr(self, name)[row].item() for name in _NUMBERS},
             **{name: getattr(self, name)[row] for name in _VECTORS},
         )
 
@@ -137,19 +132,28 @@ class ContactSet:
         return (self[row] for row in range(len(self)))
 
 
-_SCALARS = ("age_s", "load", "peak", "area_m2", "force_n", "load_whole", "uncertainty")
-_COUNTS = ("n", "clipped")
-_VECTORS = ("cop_m", "normal", "velocity_m_s")
-COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "id": ("<u4", ()),
-    **dict.fromkeys(_SCALARS, ("<f4", ())),
-    **dict.fromkeys(_COUNTS, ("<u4", ())),
-    **dict.fromkeys(_VECTORS, ("<f4", (3,))),
-    "frame": ("<i2", ()),
-    "kind": ("u1", ()),
-    "provisional": ("u1", ()),
+_WHOLE = "estimate of the load with what threshold and clipping cut off; NaN: most of it is"
+COLUMNS: Columns = {
+    "id": ("<u4", (), "", "the same as long as the contact lasts; 0: this row is empty"),
+    "age_s": ("<f4", (), "s", "since it began"),
+    "load": ("<f4", (), None, "sum of the values of its taxels"),
+    "peak": ("<f4", (), None, "the largest of them"),
+    "area_m2": ("<f4", (), "m2", "that its taxels stand for"),
+    "force_n": ("<f4", (), "N", "of values in N, or of pressures in Pa by area"),
+    "load_whole": ("<f4", (), None, _WHOLE),
+    "uncertainty": ("<f4", (), None, "how much of the load could be noise or drift; NaN: not known"),
+    "n": ("<u4", (), "", "number of its taxels"),
+    "clipped": ("<u4", (), "", "number of its taxels that are at the end of their range"),
+    "cop_m": ("<f4", (3,), "m", "its centre, in its frame"),
+    "normal": ("<f4", (3,), "", "outwards, of length 1"),
+    "velocity_m_s": ("<f4", (3,), "m/s", "of its centre"),
+    "frame": ("<i2", (), "", "row of frame_name; -1: not known"),
+    "kind": ("u1", (), "", "0: a touch, 1: a hold, 2: sliding"),
+    "provisional": ("u1", (), "", "1: only its last frames speak for it, and its load is 0"),
 }
-"""Dtype and shape, per contact, of each array of a :class:`ContactSet`."""
+"""Dtype, shape, unit (None: that of the values) and meaning, per contact, of each array of a :class:`ContactSet`."""
+_VECTORS = [name for name, (_, shape, *_) in COLUMNS.items() if shape]
+_NUMBERS = [name for name in COLUMNS if name not in ("frame", "kind", "provisional", *_VECTORS)]
 
 
 class Contacts:
@@ -207,11 +211,7 @@ class Contacts:
     ) -> Self:
         """Make one for the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
 
-        Args:
-            structure: structure of the driver.
-            type_name: which sensors.
-            neighbours: default: from their places, as far as they are known.
-            tracking: settings of the tracking.
+        Neighbours are found from the places, as far as they are known, unless they are given.
 
         Raises:
             StructureError: the driver has no such sensors.
@@ -253,7 +253,7 @@ class Contacts:
         taxels = np.flatnonzero(touched if onset is None else touched | onset)
         contact_of = np.full(self._n, NO_CONTACT, np.int16)
         if not len(taxels) and self._tracker.rests(time_ns):
-            nothing = {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in COLUMNS.items()}
+            nothing = {name: np.zeros(shape, dtype) for name, (dtype, shape, *_) in rows_of(COLUMNS, 0).items()}
             return ContactSet(contact_of=contact_of, beyond=0, frames=self.frames, **nothing)
         contact, count = self._components.of(taxels)
         load = value[taxels].astype(np.float64)
@@ -277,13 +277,13 @@ class Contacts:
             cut += np.bincount(contact, clipped[taxels], count)
         unsure = np.full(count, np.nan) if uncertainty is None else np.bincount(contact, uncertainty[taxels], count)
         found |= {"clipped": cut, "uncertainty": unsure, "load_whole": self._whole(found, cut, load)}
-        found |= self._tracker.follow(blobs, time_ns)._asdict()
+        found |= self._tracker.follow(blobs, time_ns)
         order = np.lexsort([found["id"], -found["age_s"]])
         order = order[found["id"][order] > 0]
         row = np.full(count, NO_CONTACT)
         row[order] = np.arange(len(order))
         contact_of[taxels] = row[contact]
-        columns = {name: found[name][order].astype(dtype) for name, (dtype, _) in COLUMNS.items()}
+        columns = {name: found[name][order].astype(dtype) for name, (dtype, *_) in COLUMNS.items()}
         return ContactSet(contact_of=contact_of, beyond=beyond, frames=self.frames, **columns)
 
     def _measure(self, taxels: Whole, contact: Whole, load: Doubles, count: int) -> dict[str, npt.NDArray[Any]]:
@@ -316,7 +316,7 @@ class Contacts:
         }
 
     def _whole(self, found: dict[str, npt.NDArray[Any]], cut: Doubles, load: Doubles) -> Doubles:
-        """(count,) the loads of bells of which only what is above the threshold, and below the clipping, was seen."""
+        """(count,) the loads of bells of which only the part above the threshold and below the clipping was seen."""
         if len(load) and (load > 0).any():
             least = float(load[load > 0].min())
             self._least = least if not self._least else self._least + _LEAST_SHARE * (least - self._least)

@@ -100,7 +100,6 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError("y must not fall from knot to knot")
 
     def scaled(self, gain: float, uid: tuple[int, ...]) -> Curve:
-        """Return the curve of some taxels whose results are larger by a factor."""
         names = ("lag", "creep", "temperature")
         terms = {name: gain * getattr(self, name) for name in names}
         return msgspec.structs.replace(self, y=tuple(gain * y for y in self.y), uid=uid, **terms)
@@ -144,20 +143,12 @@ def read_curves(path: str | Path) -> tuple[Curve, ...]:
 
 
 class CurveTable:
-    """The curves of n taxels of one type.
-
-    Args:
-        curves: all curves; those of other types are ignored.
-        type_name: type of the taxels.
-        uid: (n,) uids of the taxels.
+    """The curves of n taxels of one type, by their uids; curves of other types are ignored.
 
     Attributes:
-        unit: unit of the results.
-        from_unit: unit of the values.
-        minimum: (n,) float32, least result of each.
-        maximum: (n,) float32, largest result of each.
-        remembers: whether results depend on values before.
-        warms: whether results depend on the temperature.
+        unit, from_unit: of the results, and of the values.
+        minimum, maximum: (n,) float32, least and largest result of each.
+        remembers, warms: whether results depend on values before, and on the temperature.
 
     Raises:
         ConfigurationError: a taxel without a curve, or curves of several units.
@@ -198,10 +189,7 @@ class CurveTable:
     def step(self, values: Floats, passed_s: float, temperature_c: float = math.nan) -> Floats:
         """Return (n,) the results for the next (n,) values; 0 stays 0 where the past counts.
 
-        Args:
-            values: the values.
-            passed_s: since those before, s.
-            temperature_c: of the skin; NaN: not known.
+        ``passed_s`` is the time since those before, ``temperature_c`` that of the skin; NaN: not known.
         """
         found = self(values)
         play, weight, creep_s, creep, warmth, at_c, *_ = self._terms
@@ -229,11 +217,7 @@ class CurveTable:
 
 
 class LoadMemory:
-    """Follows the past of n taxels, as far as their force depends on it.
-
-    Args:
-        n: number of taxels.
-    """
+    """Follows the past of n taxels, as far as their force depends on it."""
 
     def __init__(self, n: int) -> None:
         self._follows, self._slow = np.zeros(n), np.zeros(n)
@@ -255,11 +239,6 @@ class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
     file: str
 
     def stage(self, taxels: Taxels) -> CurveStage:
-        """Make the stage for some taxels.
-
-        Raises:
-            ConfigurationError: the file cannot be read, a taxel has no curve, or they are for another unit.
-        """
         table = CurveTable(read_curves(self.file), taxels.type.name, taxels.uid)
         if table.from_unit != taxels.type.unit:
             raise ConfigurationError(f"the curves are for {table.from_unit}, and the values are in {taxels.type.unit}")

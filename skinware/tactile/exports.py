@@ -22,13 +22,7 @@ ICUB_NEWTONS_PER_COUNT = 0.05
 
 
 class IcubPart(NamedTuple):
-    """The part of a robot that contacts are on, in the numbers of the iCub's own enumerations.
-
-    Attributes:
-        body_part: body part.
-        link: link of the body part.
-        skin_part: skin part.
-    """
+    """The part of a robot that contacts are on: body part, its link and skin part, in the numbers of the iCub."""
 
     body_part: int
     link: int

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Self
 
 import msgspec
@@ -31,7 +30,7 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
-from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole
+from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole, check_state
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_evidence import Dues, Noise, Use
 from skinware.tactile.health_relations import Copies, Dropouts, Twins, lower_median
@@ -89,24 +88,6 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
         for name in self.__struct_fields__:
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigurationError(f"{name} = {getattr(self, name)}: give a number above 0")
-
-
-@dataclass(frozen=True, eq=False)
-class _Related:
-    """Which of n taxels show what presses others: the kind of fault, those others, and how much of it."""
-
-    kind: Bytes
-    other: npt.NDArray[np.int32]
-    shown: Doubles
-
-    def note(
-        self,
-        kind: HealthKind,
-        taxels: Whole,
-        others: Whole,
-        shown: Doubles,
-    ) -> None:
-        self.kind[taxels], self.other[taxels], self.shown[taxels] = kind, others, shown
 
 
 class Health:
@@ -208,7 +189,7 @@ class Health:
         rests_at_end = bool(len(known)) and float(np.median(known)) > _USUAL  # hardware that cuts off its own noise
         is_end = self._is_at_end(use.value) & (not rests_at_end)
         stuck = self._stuck(still_s, dead)
-        related = self._related(shown)
+        shows_other, other, other_shown = self._related(shown)
         often = max(settings.dropouts, _OFTEN * float(np.percentile(self._dropouts.count, 75)))
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
@@ -216,11 +197,11 @@ class Health:
             (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
             (HealthKind.DYING, kept < settings.dying * self._median_around(kept, settings.dying)),
             (HealthKind.DEAD, dead),
-            (HealthKind.CROSSTALK, related.kind == HealthKind.CROSSTALK),
+            (HealthKind.CROSSTALK, shows_other == HealthKind.CROSSTALK),
             (HealthKind.NOISY, noise_times > settings.noisy),
             (HealthKind.INTERMITTENT, self._dropouts.count >= often),
-            (HealthKind.SWAPPED, related.kind == HealthKind.SWAPPED),
-            (HealthKind.SHORTED, related.kind == HealthKind.SHORTED),
+            (HealthKind.SWAPPED, shows_other == HealthKind.SWAPPED),
+            (HealthKind.SHORTED, shows_other == HealthKind.SHORTED),
             (HealthKind.STUCK, stuck),
             (HealthKind.CLIPPED, is_end & (stuck | (at_end > settings.clipped))),
         ):
@@ -239,26 +220,30 @@ class Health:
             "recent": np.where(self._dues.hard_touches > 0, self._dues.recent, math.nan),
             "best": np.where(self._dues.best > 0, self._dues.best, math.nan),
             "dropouts": self._dropouts.count,
-            "other": related.other,
-            "other_shown": related.shown,
+            "other": other,
+            "other_shown": other_shown,
         }
-        return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
+        return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, *_) in COLUMNS.items()})
 
-    def _related(self, shown: Doubles) -> _Related:
-        """Find the taxels whose signals belong to others."""
+    def _related(self, shown: Doubles) -> tuple[Bytes, Whole, Doubles]:
+        """(n,) the fault of taxels that show what presses others, those others, and how much of it they show."""
         settings, n = self.settings, len(shown)
-        related = _Related(np.zeros(n, np.uint8), np.full(n, -1, np.int32), np.full(n, math.nan))
-        copied, other, share = self._copies.found(settings.crosstalk, _ALIKE, 2 * settings.touches)
-        related.note(HealthKind.CROSSTALK, copied, other, share)
+        kind, other, part = np.zeros(n, np.uint8), np.full(n, -1), np.full(n, math.nan)
+
+        def note(of: HealthKind, taxels: Whole, others: Whole, shares: Doubles) -> None:
+            kind[taxels], other[taxels], part[taxels] = of, others, shares
+
+        copied, origin, share = self._copies.found(settings.crosstalk, _ALIKE, 2 * settings.touches)
+        note(HealthKind.CROSSTALK, copied, origin, share)
         same = share >= _SAME
-        related.note(HealthKind.SHORTED, copied[same], other[same], share[same])
+        note(HealthKind.SHORTED, copied[same], origin[same], share[same])
         same &= ~(shown[copied] < settings.weak)  # otherwise it may be at another place
-        related.note(HealthKind.SHORTED, other[same], copied[same], share[same])
+        note(HealthKind.SHORTED, origin[same], copied[same], share[same])
         taxels, others = self._twins.found(_SQUARES, _OTHER_SQUARES, 2 * settings.touches)
-        related.note(HealthKind.SHORTED, taxels, others, np.ones(len(taxels)))
+        note(HealthKind.SHORTED, taxels, others, np.ones(len(taxels)))
         taxels, others = self._dues.exchanges.found(_EXCHANGED, settings.touches)
-        related.note(HealthKind.SWAPPED, taxels, others, np.full(len(taxels), math.nan))
-        return related
+        note(HealthKind.SWAPPED, taxels, others, np.full(len(taxels), math.nan))
+        return kind, other, part
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return what is known, by name: arrays (n, ...), copies; times are how long ago, s."""
@@ -277,11 +262,8 @@ class Health:
         Raises:
             ConfigurationError: that is no such state.
         """
-        here, m = rows >= 0, int(rows.max(initial=-1)) + 1
-        for name, own in self.state().items():
-            given = state.get(name)
-            if given is None or given.dtype != own.dtype or given.shape[1:] != own.shape[1:] or len(given) < m:
-                raise ConfigurationError(f"no state of health: {name} is missing or has a wrong shape or dtype")
+        check_state("health", state, self.state(), rows)
+        here = rows >= 0
         then = rows[here]
         for name, array in self._known().items():
             array[here] = state[name][then]
@@ -307,7 +289,7 @@ class Health:
         return at_end
 
     def _stuck(self, still_s: Doubles, dead: Flags) -> Flags:
-        """Find taxels that have not changed for long, although their module was touched, and that nothing holds now."""
+        """Whether taxels have not changed for long, although their module was touched, and nothing holds them now."""
         long = still_s >= self.settings.stuck_s
         found = np.zeros(len(long), bool)
         if not long.any():

@@ -31,28 +31,21 @@ _MOST_ALONE = 256  # taxels that are compared with all others of their modules
 
 
 def lower_median(numbers: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], Whole]:
-    """Return (m,) the lower median of the numbers of each row that are not NaN, and (m,) how many these are."""
+    """(m,) the lower median of the numbers of each row that are not NaN, and (m,) how many these are."""
     ordered = np.sort(numbers, axis=1)  # NaN comes last
     count: Whole = (~np.isnan(ordered)).sum(axis=1)
     return ordered[np.arange(len(numbers)), np.maximum(count - 1, 0) // 2], count
 
 
 def _most_around(table: Table, taxels: Whole, changes: Floats) -> Floats:
-    """Return (m,) the largest change of the neighbours of m taxels."""
+    """(m,) the largest change of the neighbours of m taxels."""
     around = table[taxels]
     most: Floats = np.where(around == NONE, np.float32(0), changes[around]).max(axis=1, initial=0)
     return most
 
 
 class Dropouts:
-    """Counts how often each of n taxels loses its value and has it back soon, while its neighbours keep theirs.
-
-    Args:
-        table: (n, k) neighbours.
-
-    Attributes:
-        count: (n,) float32; half of it is forgotten in ten minutes.
-    """
+    """Counts how often each of n taxels loses its value and has it back soon, while its neighbours keep theirs."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -62,16 +55,7 @@ class Dropouts:
         self._before, self._lost = np.zeros((2, len(table)), np.float32)
 
     def add(self, now_s: float, before: Floats, given: Floats, at_end: Flags, calm: Calm, far: Floats) -> None:
-        """Take the next frame in.
-
-        Args:
-            now_s: its time.
-            before: (n,) the values before.
-            given: (n,) its values.
-            at_end: (n,) which of them are at an end of the range.
-            calm: what the baseline made of it.
-            far: (n,) a difference from the baseline that is no noise.
-        """
+        """Take the next frame in; ``far`` from its baseline, a difference is no noise."""
         jump = np.abs(given - before)
         was_still = self._still >= _STILL_FRAMES
         self._still = np.where(jump <= far, self._still + 1, 0)
@@ -93,12 +77,11 @@ class Dropouts:
         self._lost_s[lost], self._before[lost], self._lost[lost] = now_s, before[lost], given[lost]
 
     def forget(self, passed_s: float) -> None:
-        """Let older dropouts count less."""
         self.count *= np.float32(0.5 ** (passed_s / _FORGET_S))
 
 
 class Exchanges:
-    """Compares taxels that show little with what is due to others such: it shows which place a signal comes from."""
+    """Compares taxels that show little with what is due to others such, for the place that a signal comes from."""
 
     def __init__(self, n: int) -> None:
         self.taxels: Whole = np.zeros(0, np.int64)
@@ -125,12 +108,7 @@ class Exchanges:
         self._rank[taxels] = np.arange(count)
 
     def note(self, taxels: Whole, above: Floats) -> None:
-        """Keep what is shown at the hardest moment so far of a touch of these.
-
-        Args:
-            taxels: at their hardest moment.
-            above: (n,) values above the baselines.
-        """
+        """Keep what is shown at the hardest moment so far of a touch of these, by (n,) values above the baselines."""
         rank = self._rank[taxels]
         self._moment[rank[rank >= 0]] = np.maximum(above[self.taxels], 0)
 
@@ -144,7 +122,7 @@ class Exchanges:
         self._moment[rank] = 0
 
     def found(self, share: float, touches: int) -> tuple[Whole, Whole]:
-        """Return (m,) the taxels that show at least this share of the due of others, and (m,) those others."""
+        """(m,) the taxels that show at least this share of the due of others, and (m,) those others."""
         known = self._touches >= touches
         shares = np.where(known[:, None], self._shown, 0) / np.where(known, self._due, 1)[:, None]
         if not len(shares):
@@ -155,12 +133,7 @@ class Exchanges:
 
 
 class Copies:
-    """Finds taxels that change with another of their module, while their own neighbours do not.
-
-    Args:
-        module: (n,) of each taxel.
-        table: (n, k) neighbours.
-    """
+    """Finds taxels that change with another of their module, while their own neighbours do not."""
 
     def __init__(self, module: npt.NDArray[np.intp], table: Table) -> None:
         self._module, self._table = module, table
@@ -170,14 +143,7 @@ class Copies:
         self._alone: dict[int, _Alone] = {}
 
     def add(self, now_s: float, given: Floats, usable: Flags, clear: float) -> None:
-        """Take the next frame in.
-
-        Args:
-            now_s: its time.
-            given: (n,) its values.
-            usable: (n,) which values are known.
-            clear: a change above it is no noise.
-        """
+        """Take the next frame in; a change above ``clear`` is no noise."""
         if now_s - self._before_s < _CHANGE_S:
             return
         change = given - self._before
@@ -203,15 +169,12 @@ class Copies:
             self._alone[taxel].add(now_s, float(change[taxel]), change, clear)
 
     def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, Doubles]:
-        """Find taxels that show a part of the touches of others.
+        """Find taxels that show a part of the touches of others: (m,) they, (m,) those others, and (m,) the part.
 
         Args:
             share: the least part.
             alike: the least correlation of both.
             touches: that a taxel must have shown while its neighbours were not touched.
-
-        Returns:
-            (m,) the taxels, (m,) those others, and (m,) the part.
         """
         found = []
         for taxel, alone in self._alone.items():
@@ -246,7 +209,7 @@ class _Alone:
         self._squares += others * others
 
     def nearest(self) -> tuple[int, float, float]:
-        """Return the other that is most alike, the part of it that the taxel shows, and the correlation."""
+        """The other that is most alike, the part of it that the taxel shows, and the correlation."""
         size = np.sqrt(self._squares * self._own)
         alike = np.where(size > 0, self._both, 0) / np.where(size > 0, size, 1)
         best = int(np.argmax(alike))
@@ -254,11 +217,7 @@ class _Alone:
 
 
 class Twins:
-    """Compares each of n taxels with its neighbours: two that always show the same are shorted.
-
-    Args:
-        table: (n, k) neighbours.
-    """
+    """Compares each of n taxels with its neighbours: two that always show the same are shorted."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -267,14 +226,7 @@ class Twins:
         self._compared_s = np.full(len(table), -math.inf)
 
     def add(self, now_s: float, above: Floats, calm: Calm, noise: float) -> None:
-        """Take the next frame in.
-
-        Args:
-            now_s: its time.
-            above: (n,) values above the baselines.
-            calm: what the baseline made of it.
-            noise: standard deviation of the typical taxel.
-        """
+        """Take the next frame in: its values above the baselines, and the noise of the typical taxel."""
         rows = np.flatnonzero(calm.touched & (above > _PLAIN * noise))[:_MOST_COMPARED]
         if not len(rows) or not self._table.shape[1]:
             return
@@ -290,16 +242,13 @@ class Twins:
         self._size[rows] += is_there * (own * own + others * others)
 
     def found(self, same: float, other: float, touches: int) -> tuple[Whole, Whole]:
-        """Find pairs that always show the same.
+        """Find pairs that always show the same: (m,) taxels, and (m,) those with which they are the same.
 
         Args:
             same: two are the same whose squared differences, less those of noise, are less than this part of their
                 squares.
             other: the median of the other neighbours differs by at least this part.
             touches: that are needed.
-
-        Returns:
-            (m,) taxels, and (m,) those with which they are the same.
         """
         known = np.flatnonzero(self.touches >= touches)
         if not len(known) or not self._table.shape[1]:

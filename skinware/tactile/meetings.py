@@ -29,32 +29,18 @@ _EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")
 """Fields that belong to an identity, and not to a place."""
 
 
-class Fitted(NamedTuple):
-    """Bells in a blob.
-
-    Attributes:
-        place: (k, 3) m, their centres.
-        variance_m2: (k,) m2, along the skin.
-        peak: (k,) their heights.
-    """
-
-    place: Doubles
-    variance_m2: Doubles
-    peak: Doubles
-
-
 def fit_bells(
     value: Doubles, position: Doubles, place: Doubles, variance_m2: Doubles, peak: Doubles, width: Doubles
-) -> Fitted:
+) -> tuple[Doubles, Doubles, Doubles]:
     """Fit k bells of known widths to the values of a blob, by Gauss-Newton steps from where they are expected.
 
     Args:
-        value: (a,) of its taxels.
-        position: (a, 3) m, their places.
-        place: (k, 3) m, expected centres.
-        variance_m2: (k,) m2, of these.
-        peak: (k,) expected heights.
-        width: (k,) m, standard deviation of each bell.
+        value, position: (a,) of its taxels, and (a, 3) m, their places.
+        place, variance_m2: (k, 3) m, expected centres, and (k,) m2, how uncertain these are.
+        peak, width: (k,) expected heights, and (k,) m, the standard deviation of each bell.
+
+    Returns:
+        (k, 3) m, their centres, (k,) m2, the variances of these along the skin, and (k,) their heights.
     """
     k = len(place)
     log_peak = np.log(np.maximum(peak, _SMALL))
@@ -75,7 +61,7 @@ def fit_bells(
     covariance = np.linalg.inv(information).reshape(k, 4, k, 4)
     of_place = covariance[np.arange(k), :3, np.arange(k), :3]
     along_skin = np.linalg.eigvalsh(of_place)[:, :2].mean(axis=1)  # across it, nothing is seen
-    return Fitted(unknown[:, :3], along_skin, np.exp(unknown[:, 3]))
+    return unknown[:, :3], along_skin, np.exp(unknown[:, 3])
 
 
 class _Meeting(NamedTuple):
@@ -96,9 +82,6 @@ class Meetings:
 
     That they went on, as their velocities said, is more likely than that they turned round. Against it speak their
     lanes, the part of their distance that lies across their relative motion, and their loads.
-
-    Args:
-        pitch_m: of the taxels, m.
     """
 
     def __init__(self, pitch_m: float) -> None:
@@ -191,13 +174,7 @@ class Meetings:
 
 
 def resume(tracks: Tracks, frames: int, pitch_m: float) -> None:
-    """Give a contact that begins at speed the identity of one that has just gone where it comes from.
-
-    Args:
-        tracks: after the frame; changed in place.
-        frames: in how many a contact must be seen.
-        pitch_m: of the taxels, m.
-    """
+    """Give a contact that begins at speed the identity of one that has just gone where it comes from, in place."""
     new = np.flatnonzero((tracks["home"] >= 0) & (tracks["id"] == 0) & (tracks["frames"] == frames))
     gone = np.flatnonzero((tracks["home"] < 0) & (tracks["id"] > 0))
     if not 0 < len(new) * len(gone) <= _MOST_PAIRS:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import Index
-from skinware.tactile.arrays import Doubles, Floats
+from skinware.tactile.arrays import Arrays, Columns, Doubles, Floats, rows_of
 from skinware.tactile.contacts import ContactSet
 
 
@@ -52,10 +52,9 @@ class MotionSet:
 
     Attributes:
         names: names of the regions.
-        load: (r,) float32.
+        load, speed_m_s: (r,) float32.
         contacts: (r,) uint32.
         velocity_m_s: (r, 3) float32.
-        speed_m_s: (r,) float32.
         frame: (r,) int16, index into ``frames``; -1 if it is not known.
         frames: names of the coordinate frames.
     """
@@ -87,14 +86,14 @@ class MotionSet:
         return (self[row] for row in range(len(self)))
 
 
-COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "load": ("<f4", ()),
-    "contacts": ("<u4", ()),
-    "velocity_m_s": ("<f4", (3,)),
-    "speed_m_s": ("<f4", ()),
-    "frame": ("<i2", ()),
+COLUMNS: Columns = {
+    "load": ("<f4", (), None, "sum of the values of its touched sensors"),
+    "contacts": ("<u4", (), "", "number of contacts that reach into it"),
+    "velocity_m_s": ("<f4", (3,), "m/s", "mean velocity of its contacts; NaN: none is known"),
+    "speed_m_s": ("<f4", (), "m/s", "length of it"),
+    "frame": ("<i2", (), "", "row of frame_name; -1: not known"),
 }
-"""Dtype and shape, per region, of each array of a :class:`MotionSet`."""
+"""Dtype, shape, unit (None: that of the values) and meaning, per region, of each array of a :class:`MotionSet`."""
 
 
 def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
@@ -107,9 +106,8 @@ def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDA
         contacts: contacts of the frame.
         value: (n,) calmed values, as for :meth:`.Contacts.update`.
     """
-    found: dict[str, npt.NDArray[Any]] = {
-        name: np.zeros((len(regions), *shape), dtype) for name, (dtype, shape) in COLUMNS.items()
-    }
+    columns = rows_of(COLUMNS, len(regions))
+    found: Arrays = {name: np.zeros(shape, dtype) for name, (dtype, shape, *_) in columns.items()}
     for row, index in enumerate(regions.values()):
         contact = contacts.contact_of[index]
         touched = contact >= 0

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
+from skinware.tactile.arrays import rows_of
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion_of
 from skinware.tactile.regions import Regions
@@ -35,20 +36,9 @@ from skinware.tactile.source_service import (
 
 NAME = "motion"
 
-_ABOUT: dict[str, tuple[str | None, str]] = {
-    "load": (None, "sum of the values of its touched sensors"),
-    "contacts": ("", "number of contacts that reach into it"),
-    "velocity_m_s": ("m/s", "mean velocity of its contacts; NaN: none is known"),
-    "speed_m_s": ("m/s", "length of it"),
-    "frame": ("", "row of frame_name; -1: not known"),
-}
-
-
-def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
-    return {name: (dtype, (len(source.regions), *shape)) for name, (dtype, shape) in COLUMNS.items()}
-
-
-_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "regions"), _ABOUT, _columns_of)
+_FORM = ServiceForm(
+    NAME, ("driver", "type_name", "unit", "frames", "regions"), lambda source: rows_of(COLUMNS, len(source.regions))
+)
 
 
 class MotionSample(SourceSample):
@@ -69,10 +59,6 @@ class MotionSample(SourceSample):
 class MotionReader(SourceReader[MotionSample]):
     """Reads the service ``motion``: a :class:`skinware.service.ServiceReader` whose samples are motion.
 
-    Args:
-        name: of the service.
-        namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
-
     Raises:
         BadServiceFile: the service is of another kind.
     """
@@ -91,8 +77,7 @@ class MotionWriter(SourceWriter):
         frames: names of the coordinate frames of its contacts.
         driver: its name, for readers.
         name: of the service.
-        options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`, which also lists
-            the errors.
+        options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`.
 
     Raises:
         StructureError: the driver has no such sensors.

@@ -202,7 +202,6 @@ def _pairs_within_1(frame: Whole, places: Doubles) -> tuple[Whole, Whole]:
 
 
 def _table(one: Whole, other: Whole, n: int) -> Table:
-    """The table of pairs, each given at least once in one direction."""
     pairs = np.sort(np.concatenate([one * n + other, other * n + one]))  # np.unique sorts ten times as long
     pairs = pairs[np.diff(pairs, prepend=-1) > 0]
     row, neighbour = pairs // max(n, 1), pairs % max(n, 1)
@@ -234,11 +233,12 @@ def checked(table: npt.NDArray[Any], n: int) -> Table:
 class Components:
     """Finds the components of touched taxels.
 
+    Touched taxels of one module that have no neighbours at all hang together; without modules, each is alone.
+
     Args:
         n: number of taxels.
         neighbours: (n, k) int, -1 fills its rows; None: not known.
-        module: (n,) int, the module of each taxel: touched taxels of one module that have no neighbours at all hang
-            together. None: each is alone.
+        module: (n,) int, the module of each taxel.
 
     Raises:
         ConfigurationError: the table is not one of n taxels.
@@ -253,10 +253,9 @@ class Components:
         self._position = np.full(n + 1, NONE, np.int32)  # among those that are touched; the last one is that of NONE
 
     def of(self, touched: Whole) -> tuple[Whole, int]:
-        """Return (m,) int64 the component of each of m touched taxels, counted from 0 in their order; and their number.
+        """Return (m,) int64 the component of each of m taxels, counted from 0 in their order; and their number.
 
-        Args:
-            touched: (m,) int64, taxels in ascending order.
+        ``touched`` is (m,) int64, ascending.
         """
         self._position[touched] = np.arange(len(touched))
         beside = self._position[self._forward[touched]].reshape(-1)

@@ -32,10 +32,7 @@ class Onsets:
     """Finds which of n taxels have risen beyond their own noise in two of the last three frames.
 
     Nothing is smoothed: a spike of one frame is none, and a touch is found in its second frame, at any rate.
-
-    Args:
-        n: number of taxels.
-        resolution: step of the values, in the unit of the noise; 0 if they have none.
+    ``resolution`` is the step of the values, in the unit of the noise; 0 if they have none.
     """
 
     def __init__(self, n: int, resolution: float = 0.0) -> None:
@@ -92,12 +89,7 @@ class Events:
         self._seen: dict[int, tuple[Contact, int]] = {}
 
     def of(self, contacts: ContactSet, acquired_ns: int) -> list[ContactEvent]:
-        """Return what has happened since the last frame.
-
-        Args:
-            contacts: of the newest frame.
-            acquired_ns: of this frame.
-        """
+        """Return the events since the last frame, by the contacts of the newest, and when that was acquired."""
         found = []
         for contact in contacts:
             before = self._seen.get(contact.id)

@@ -191,13 +191,12 @@ def _named(names: Sequence[set[str]], wanted: Sequence[str]) -> Flags:
 
 @dataclass(frozen=True)
 class SensorChoice:
-    """A choice of sensors: those to which all conditions apply.
+    """A choice of sensors: those to which all conditions apply; an empty one applies to all.
 
     Attributes:
-        types: names of sensor types; empty: all.
-        patches: names of patches; empty: all.
+        types, patches: names of sensor types, and of patches.
         regions: the regions that ``in_regions`` refers to.
-        in_regions: names of regions; a sensor is in any of them; empty: all.
+        in_regions: names of regions; a sensor is in any of them.
     """
 
     types: Collection[str] = ()
@@ -209,22 +208,13 @@ class SensorChoice:
         return bool(self.types or self.patches or self.in_regions)
 
     def unknown(self, structures: Sequence[Structure]) -> Iterator[str]:
-        """Yield a line for each name that does not exist.
-
-        Args:
-            structures: structures of all drivers.
-        """
+        """Yield a line for each name that does not exist in the structures of all drivers."""
         yield from unknown("sensor type", self.types, [each.name for one in structures for each in one.types])
         yield from unknown("patch", self.patches, [name for one in structures for name in one.patch_names])
         yield from unknown("region", self.in_regions, [region.name for region in self.regions])
 
     def of(self, driver: str, structure: Structure) -> Flags:
-        """Return (n_sensors,) bool: the chosen sensors of a driver, in the order of its frames.
-
-        Args:
-            driver: name of the driver.
-            structure: structure of the driver.
-        """
+        """Return (n_sensors,) bool: the chosen sensors of a driver, in the order of its frames."""
         wanted, layout = np.zeros(structure.n_sensors, bool), SkinLayout((driver,), (structure,))
         for name in [each.name for each in structure.types if not self.types or each.name in self.types]:
             inside = np.full(len(structure.module_of(name)), not self.in_regions)
@@ -276,12 +266,7 @@ def read_regions(*paths: str | Path) -> Regions:
 
 
 def regions_to_toml(regions: Iterable[Region], comment: str = "") -> str:
-    """Return the text of a file of regions.
-
-    Args:
-        regions: the regions.
-        comment: lines for its head.
-    """
+    """Return the text of a file of regions, with the lines of a comment at its head."""
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     return "\n".join(lines) + "\n" + "".join(f"\n{_region_text(region)}" for region in regions)
 

@@ -90,11 +90,7 @@ class Taxels:
 
     @classmethod
     def of(cls, structure: Structure, type_name: str) -> Taxels:
-        """Return the taxels of a type of a driver.
-
-        Raises:
-            StructureError: no such type here.
-        """
+        """Return the taxels of a type of a driver; raises StructureError if it has no such type."""
         sensor_type = structure.type(type_name)
         return cls(
             sensor_type,
@@ -125,7 +121,7 @@ class Stage(ABC):
         self._time_ns: int | None = None
 
     def _passed_s(self, signal: Signal) -> float:
-        """Return the seconds since the frame before; 0 for the first."""
+        """The seconds since the frame before; 0 for the first."""
         before_ns, self._time_ns = self._time_ns, signal.time_ns
         return 0.0 if before_ns is None else max(0, signal.time_ns - before_ns) / NS_PER_S
 
@@ -148,7 +144,9 @@ class Stage(ABC):
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="stage"):
-    """Settings of a stage. Each has a method ``stage`` that makes it.
+    """Settings of a stage. Each has a method ``stage`` that makes it for some taxels.
+
+    That raises ConfigurationError where it cannot be made; the message says why.
 
     Attributes:
         types: the sensor types that it is for; None: all for which it can be made.
@@ -174,7 +172,6 @@ class FilterSettings(StageSettings, frozen=True, kw_only=True, tag="filter"):
     frames: Annotated[int, msgspec.Meta(ge=2, le=99)] = 3
 
     def stage(self, taxels: Taxels) -> Stage:
-        """Make the stage for some taxels."""
         return Lowpass(taxels, self.tau_s) if self.method == "lowpass" else LastFrames(taxels, self.frames, self.method)
 
 
@@ -239,11 +236,6 @@ class ScalerSettings(StageSettings, frozen=True, kw_only=True, tag="scaler"):
             raise ConfigurationError(f"low = {self.low}, high = {self.high}: give a range")
 
     def stage(self, taxels: Taxels) -> Stage:
-        """Make the stage for some taxels.
-
-        Raises:
-            ConfigurationError: the type has no range; the message says what to do.
-        """
         span = taxels.type.maximum - taxels.type.minimum
         if self.source == "range" and not 0 < span < math.inf:
             least, most = taxels.type.minimum, taxels.type.maximum
@@ -302,7 +294,6 @@ class AmplifierSettings(StageSettings, frozen=True, kw_only=True, tag="amplifier
             )
 
     def stage(self, taxels: Taxels) -> Stage:
-        """Make the stage for some taxels."""
         return Amplifier(taxels, self)
 
 

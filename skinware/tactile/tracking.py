@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.arrays import Doubles, Flags, Whole
+from skinware.tactile.arrays import Arrays, Doubles, Flags, Whole
 from skinware.tactile.meetings import Meetings, fit_bells, resume
 from skinware.tactile.tracks import TRACK, TouchedBlobs, Tracks, assign, correct, expected_at, is_shared, without_nan
 
@@ -76,31 +75,16 @@ class TrackingSettings:
     steady: float = 0.25
 
 
-class Tracked(NamedTuple):
-    """The history of the m blobs of a frame.
-
-    Attributes:
-        id: (m,) int64, from 1 on; numbers repeat only after 2**32; 0: not a contact yet.
-        age_s: (m,) s.
-        velocity_m_s: (m, 3) m/s, NaN where the centre is not known.
-        kind: (m,) int64, :class:`ContactKind`.
-        provisional: (m,) bool, whether it was never touched for sure.
-    """
-
-    id: Whole
-    age_s: Doubles
-    velocity_m_s: Doubles
-    kind: Whole
-    provisional: Flags
-
-
-_NOTHING = Tracked(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, bool))
+_NOTHING = {
+    **{name: np.zeros(0, np.int64) for name in ("id", "kind")},
+    "age_s": np.zeros(0),
+    "velocity_m_s": np.zeros((0, 3)),
+    "provisional": np.zeros(0, bool),
+}
 
 
 class Tracker:
-    """Gives contacts their identities, frame by frame.
-
-    A blob in which contacts have merged carries the tracks of all of them.
+    """Gives contacts their identities, frame by frame. A blob in which contacts have merged carries the tracks of all.
 
     Args:
         position_m: (n, 3) m, places of the taxels.
@@ -129,8 +113,12 @@ class Tracker:
         self._time_ns = time_ns
         return True
 
-    def follow(self, blobs: TouchedBlobs, time_ns: int) -> Tracked:
-        """Return the identities of the blobs of the next frame, and how they move."""
+    def follow(self, blobs: TouchedBlobs, time_ns: int) -> Arrays:
+        """Return the history of the m blobs of the next frame, by name: arrays (m, ...).
+
+        ``id`` counts from 1 on, and repeats only after 2**32; 0: not a contact yet. ``velocity_m_s`` is (m, 3), NaN
+        where the centre is not known; a ``provisional`` contact was never touched for sure.
+        """
         self._forget(time_ns)
         before, size = self._tracks, np.bincount(blobs.blob, minlength=len(blobs.load))
         if not len(before) and not len(size):
@@ -264,7 +252,7 @@ class Tracker:
     def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: TouchedBlobs, time_ns: int) -> None:
         """Find the tracks that share a blob, each with its own bell."""
         within = np.flatnonzero(blobs.blob == tracks["home"][rows[0]])
-        fitted = fit_bells(
+        place, variance_m2, peak = fit_bells(
             blobs.value[within],
             self._position_m[blobs.taxels[within]],
             tracks["place"][rows],
@@ -272,15 +260,14 @@ class Tracker:
             tracks["height"][rows],
             tracks["width"][rows],
         )
-        tracks["found"][rows], tracks["noise"][rows] = fitted.place, fitted.variance_m2
-        tracks["height"][rows] = fitted.peak
-        share = fitted.peak * tracks["width"][rows] ** 2
+        tracks["found"][rows], tracks["noise"][rows], tracks["height"][rows] = place, variance_m2, peak
+        share = peak * tracks["width"][rows] ** 2
         tracks["now"][rows] = blobs.load[tracks["home"][rows[0]]] * share / share.sum()
         tracks["size"][rows] = np.maximum(1, np.round(len(within) * share / share.sum()))
         tracks["jumps"][rows] = False
         correct(tracks, rows, time_ns)
-        is_faint = fitted.peak < _FAINT * tracks["peak"][rows]
-        is_faint[fitted.peak.argmax()] = False
+        is_faint = peak < _FAINT * tracks["peak"][rows]
+        is_faint[peak.argmax()] = False
         tracks["home"][rows[is_faint]] = -1
 
     def _move(self, tracks: Tracks, before: Tracks) -> None:
@@ -344,8 +331,8 @@ class Tracker:
         self._taxels = np.concatenate([left, blobs.taxels])
         self._tracks = tracks
 
-    def _tracked(self, tracks: Tracks, time_ns: int) -> Tracked:
-        """Return the identity of the oldest track of each blob, and the mean of their velocities."""
+    def _tracked(self, tracks: Tracks, time_ns: int) -> Arrays:
+        """The oldest track of each blob, and the mean of their velocities."""
         here = np.flatnonzero(tracks["home"] >= 0)
         here = here[np.lexsort([tracks["key"][here], tracks["born_ns"][here], tracks["home"][here]])]
         home = tracks["home"][here]
@@ -358,8 +345,13 @@ class Tracker:
             rows = here[home == blob]
             weight = np.maximum(tracks["now"][rows], 1e-9)
             velocity[blob] = weight @ tracks["velocity"][rows] / weight.sum()
-        age_s = (time_ns - tracks["born_ns"][first]) / NS_PER_S
-        return Tracked(tracks["id"][first], age_s, velocity, tracks["kind"][first], ~tracks["sure"][first])
+        return {
+            "id": tracks["id"][first],
+            "age_s": (time_ns - tracks["born_ns"][first]) / NS_PER_S,
+            "velocity_m_s": velocity,
+            "kind": tracks["kind"][first],
+            "provisional": ~tracks["sure"][first],
+        }
 
 
 def _rank(numbers: Doubles | Whole) -> Doubles:

@@ -53,12 +53,10 @@ TRACK = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class TouchedBlobs:
-    """The m blobs of touched taxels of a frame.
+    """The m blobs of the a touched taxels of a frame.
 
     Attributes:
-        taxels: (a,) int64, the taxels of all of them.
-        blob: (a,) int64, the blob of each.
-        value: (a,) the value of each.
+        taxels, blob, value: (a,) the taxels, the blob of each, and its value.
         load, peak: (m,) sum and maximum of the values of each blob.
         frame: (m,) int64, number of its coordinate frame, -1 for none.
         cop_m: (m, 3) m, its centre; NaN if it is not known.
@@ -100,7 +98,6 @@ def expected_at(tracks: Tracks, time_ns: int) -> Tracks:
 
 
 def without_nan(numbers: Doubles) -> Doubles:
-    """The numbers, 0 in place of NaN."""
     return np.where(np.isnan(numbers), 0.0, numbers)
 
 
@@ -126,10 +123,7 @@ def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
 
 
 def assign(gain: Doubles) -> tuple[Whole, Whole]:
-    """Assign rows to columns, each at most once, so that the sum of gains is the largest.
-
-    Args:
-        gain: (r, c) gain of each pair; 0 or less: the pair is impossible.
+    """Assign rows to columns, each at most once, so that the sum of (r, c) gains is the largest; 0 or less: impossible.
 
     Returns:
         (p,) int64 rows, in ascending order, and (p,) int64, the column of each.

@@ -39,7 +39,7 @@ _update.argtypes, _update.restype = (*(ctypes.c_void_p,) * 3, ctypes.c_double, c
 
 
 def vectors_of(taxels: Mapping[str, Taxels]) -> list[tuple[str, ...]]:
-    """Return the types that are axes of the same taxels, among those of a driver by name."""
+    """The types that are axes of the same taxels, among those of a driver by name."""
     return [
         names
         for names in AXES
@@ -51,9 +51,7 @@ def vectors_of(taxels: Mapping[str, Taxels]) -> list[tuple[str, ...]]:
 class ArrayField:
     """Follows a uniform field, and how each of n three-axis taxels responds to it.
 
-    Args:
-        patch: (n,) int, the patch of each taxel. Neighbouring taxels of one patch are a rigid array.
-        spread: standard deviation of the responses around 1.
+    Neighbouring taxels of one patch are a rigid array. ``spread`` is the standard deviation of the responses around 1.
     """
 
     def __init__(self, patch: npt.NDArray[np.integer], spread: float) -> None:
@@ -72,7 +70,6 @@ class ArrayField:
         self._at = ctypes.addressof(words)
 
     def __len__(self) -> int:
-        """Return the number of arrays."""
         return len(self._memory)
 
     @property
@@ -87,12 +84,7 @@ class ArrayField:
         return bears
 
     def update(self, values: Floats, usable: Flags, passed_s: float) -> tuple[Floats, Flags]:
-        """Take in the next frame.
-
-        Args:
-            values: (3, n) float32.
-            usable: (n,) bool, which taxels have values of this frame.
-            passed_s: since the frame before.
+        """Take in (3, n) float32 values, (n,) bool usable, and the seconds since the frame before.
 
         Returns:
             (3, n) float32, the values without level and field; and (n,) bool, which of them are certain enough to say
@@ -114,11 +106,6 @@ class FieldSettings(StageSettings, frozen=True, kw_only=True, tag="field"):
     spread: Positive = 0.1
 
     def stage(self, *axes: Taxels) -> Stage:
-        """Make the stage for the three axes of some taxels.
-
-        Raises:
-            ConfigurationError: no patch has enough of them.
-        """
         stage = FieldStage(axes, self.spread)
         if not len(stage.field):
             raise ConfigurationError(f"no patch has {LEAST_ARRAY} taxels of {axes[0].type.name}")
@@ -126,11 +113,7 @@ class FieldSettings(StageSettings, frozen=True, kw_only=True, tag="field"):
 
 
 class FieldStage(Stage):
-    """Takes level and field off the three axes of n taxels.
-
-    Attributes:
-        field: the field.
-    """
+    """Takes level and field off the three axes of n taxels."""
 
     name = "field"
 
@@ -155,7 +138,6 @@ class VectorSettings(StageSettings, frozen=True, kw_only=True, tag="vector"):
     """Settings of vectors: all axes of a taxel are touched where one is."""
 
     def stage(self, *axes: Taxels) -> Stage:
-        """Make the stage for the three axes of some taxels."""
         return VectorStage(*axes)
 
 

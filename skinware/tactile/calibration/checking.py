@@ -56,11 +56,9 @@ class Finding:
 
 
 def check_file(geometry: Geometry, module: npt.NDArray[np.integer]) -> list[Finding]:
-    """Return the errors that a geometry shows by itself: shared places, taxels without a place.
+    """Return the errors that a geometry of n taxels shows by itself: shared places, taxels without a place.
 
-    Args:
-        geometry: geometry of n taxels.
-        module: (n,) module of each.
+    ``module`` is (n,), the module of each.
     """
     found: list[Finding] = []
     known = np.flatnonzero(geometry.known)
@@ -85,14 +83,7 @@ def check_strokes(
     patch: npt.NDArray[np.integer],
     topology: Topology,
 ) -> list[Finding]:
-    """Return the errors of a geometry by strokes.
-
-    Args:
-        geometry: geometry of n taxels.
-        module: (n,) module of each.
-        patch: (n,) patch of each.
-        topology: topology of the same taxels.
-    """
+    """Return the errors of a geometry of n taxels by strokes, with (n,) modules and patches, and their topology."""
     check = _Check(geometry, topology)
     named = np.zeros(len(geometry), bool)
     found: list[Finding] = []
@@ -118,18 +109,10 @@ class _Check:
     def _disagreement_m(
         self, taxels: Whole, group: Groups, place: Doubles | None = None, frame: Whole | None = None
     ) -> float:
-        """The mean difference between measured and given distances from taxels to those of other groups.
+        """The mean difference between measured and given distances from taxels to those of other groups; NaN: too few.
 
-        Taxels that are near each other in the file and were never felt together disagree, too.
-
-        Args:
-            taxels: (k,).
-            group: (n,) of all taxels.
-            place: (n, 3) their places; None: those of the file.
-            frame: (n,) frames of the places.
-
-        Returns:
-            NaN if there are too few.
+        Taxels that are near each other in the file and were never felt together disagree, too. (n, 3) places and (n,)
+        frames are those of the file unless they are given.
         """
         place = self._place if place is None else place
         frame = self._frame if frame is None else frame
@@ -145,10 +128,8 @@ class _Check:
     def swapped(self, group: Groups, named: Flags) -> Iterator[tuple[Whole, tuple[int, int], float]]:
         """Yield pairs of groups that agree at each other's places and not at their own, the clearest first.
 
-        Each pair is exchanged before the search goes on, as an exchange disturbs its neighbours.
-
-        Yields:
-            The taxels of a pair, its numbers, and how far it is off at the places of the file.
+        Each is its taxels, its numbers, and how far it is off at the places of the file. Each pair is exchanged before
+        the search goes on, as an exchange disturbs its neighbours.
         """
         while found := self._clearest_swap(group, named):
             _, both, there, pair, own = found

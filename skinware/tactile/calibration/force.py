@@ -90,12 +90,7 @@ class ForceFit:
 
 
 def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "counts") -> ForceFit:
-    """Fit curves in N to frames with a reference.
-
-    Args:
-        data: the frames; loads that rise, rest and fall, over the wanted range.
-        type_name: type of the taxels.
-        from_unit: unit of the loads.
+    """Fit curves in N to frames with a reference: loads that rise, rest and fall, over the wanted range.
 
     Raises:
         ConfigurationError: too few frames with a load, or loads that do not vary.
@@ -210,9 +205,8 @@ class _Trial:
 def _errors(problem: _Trial, presses: int) -> tuple[tuple[float, float], float, float]:
     """Standard deviation of a taxel at 0 N and its growth with the force; the whole residual; the share that it holds.
 
+    All is of frames that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
     Deviations of the taxels of a contact add up to the deviation of its force.
-
-    All of it is of frames that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
     """
     left, expected = (np.zeros_like(problem.force_n) for _ in range(2))
     part = np.arange(len(left)) * _PARTS // len(left)

@@ -279,18 +279,13 @@ class Presses:
 
     @classmethod
     def none(cls, n: int, pose_shape: tuple[int, ...] = (3,)) -> Self:
-        """Make an empty set of presses on n taxels; ``pose_shape`` is the shape of a pose."""
+        """Make an empty set of presses on n taxels, with poses of this shape."""
         nothing = np.zeros(0, np.int64)
         return cls(n, np.zeros((0, *pose_shape)), nothing, nothing, np.zeros(0))
 
     @classmethod
     def of_arrays(cls, pose: npt.ArrayLike, load: npt.ArrayLike) -> Self:
-        """Make presses from whole arrays.
-
-        Args:
-            pose: (m, 3) or (m, 4, 4).
-            load: (m, n), 0 or NaN where a taxel feels nothing.
-        """
+        """Make presses from (m, 3) or (m, 4, 4) poses and (m, n) loads, 0 or NaN where a taxel feels nothing."""
         loads = np.asarray(load, np.float64)
         if loads.ndim != 2 or len(loads) != len(np.asarray(pose)):
             raise ConfigurationError(f"loads of presses: give a row of each pose, not {loads.shape}")

@@ -16,9 +16,7 @@ _DIGITS = 6
 def confidence_of(error_m: Doubles, pitch_m: float) -> float:
     """Return the share of sensors within half a pitch of their places, if errors along the skin are normal.
 
-    Args:
-        error_m: (k,) expected error of each, root of the mean square, m.
-        pitch_m: distance between neighbours, m.
+    ``error_m`` is (k,) m, the expected error of each, root of the mean square.
     """
     within = 1 - np.exp(-((pitch_m / 2 / np.maximum(error_m, 1e-9)) ** 2))
     return round(float(within.mean()), 3)
@@ -29,12 +27,7 @@ def placed_groups(
 ) -> list[GeometryGroup]:
     """Return the groups of a geometry file, one for each module that has any place.
 
-    Args:
-        structure: structure of the skin.
-        type_name: type of the sensors.
-        placement: their places, in the order of the structure.
-        frame: coordinate frame of the poses.
-        pitch_m: distance between neighbours, for confidences.
+    Places are in the order of the structure, in the coordinate frame ``frame``; the pitch, m, is for confidences.
     """
     return [
         _group(
@@ -54,10 +47,7 @@ def placed_groups(
 def unrolled_groups(structure: Structure, type_name: str, topology: Topology) -> list[GeometryGroup]:
     """Return the groups of a geometry file in which each piece of skin is a flat map of its own.
 
-    Args:
-        structure: structure of the skin.
-        type_name: type of the sensors.
-        topology: their topology, in the order of the structure.
+    The topology is in the order of the structure.
     """
     groups: list[GeometryGroup] = []
     for piece in range(topology.n_pieces):

@@ -76,23 +76,18 @@ def _has_extent(places: Doubles) -> bool:
 
 @dataclass(frozen=True)
 class Pose:
-    """The pose of a module.
-
-    Attributes:
-        rotation: (3, 3).
-        origin_m: (3,).
-    """
+    """The pose of a module: (3, 3) rotation and (3,) origin, m."""
 
     rotation: Doubles
     origin_m: Doubles
 
     def places_m(self, shape: Shape) -> Doubles:
-        """Return (k, 3) the places of the taxels of a shape."""
+        """(k, 3) the places of the taxels of a shape."""
         places: Doubles = shape.place_m @ self.rotation.T + self.origin_m
         return places
 
     def normals(self, shape: Shape) -> Doubles:
-        """Return (k, 3) their normals."""
+        """(k, 3) their normals."""
         normals: Doubles = shape.normal @ self.rotation.T
         return normals
 

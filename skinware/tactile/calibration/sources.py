@@ -29,17 +29,9 @@ _PREFERRED = "pressure"
 class LoadSource:
     """The loads of the sensors of one type of a driver: 0 where nothing touches.
 
-    Values of a calmed driver pass unchanged, those of any other driver go through a baseline.
-
-    Args:
-        structure: structure of the driver.
-        driver_type: type of the driver.
-        type_name: which sensors; None: pressure, or else the driver's first type.
-
-    Attributes:
-        structure: structure of the driver.
-        type_name: which sensors.
-        temperature_c: of the newest frame; NaN: not measured.
+    Values of a calmed driver pass unchanged, those of any other driver go through a baseline. Without the name of a
+    type it is pressure, or else the driver's first type. ``temperature_c`` is that of the newest frame; NaN: not
+    measured.
 
     Raises:
         StructureError: no such type here.
@@ -84,14 +76,9 @@ class LoadSource:
 
 
 class PoseSource:
-    """Reads the newest pose of a service.
+    """Reads the newest pose of a service, from a column of points (3,) or poses (4, 4).
 
     A service may have several points and a column ``count`` of those that press: it has a pose while that is one.
-
-    Args:
-        reader: reader of the service.
-        column: column with the poses.
-        shape: (3,) for points, (4, 4) for poses.
 
     Raises:
         ConfigurationError: the service has no such column of floats.
@@ -126,12 +113,8 @@ class PoseSource:
 class ForceSource:
     """Pairs the force of a reference with the temperature of the skin.
 
-    Args:
-        source: the loads of the skin.
-        reference: reads the force, N: (1,), or (3,), whose length counts; None: weights are typed in.
-
-    Attributes:
-        weight_n: the known weight that presses now, N; NaN: none.
+    The reference reads the force, N: (1,), or (3,), whose length counts. Without one, ``weight_n`` is the known weight
+    that presses now, N; NaN: none.
     """
 
     def __init__(self, source: LoadSource, reference: PoseSource | ForceSource | None) -> None:

@@ -104,23 +104,13 @@ def _point(pose: Doubles) -> Doubles:
 
 
 class Session(ABC):
-    """Gathers presses or strokes until enough taxels are covered.
-
-    Attributes:
-        kind: its name in files.
-    """
+    """Gathers presses or strokes until enough taxels are covered; ``kind`` is its name in files."""
 
     kind: str
 
     @abstractmethod
     def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
-        """Take a frame.
-
-        Args:
-            time_ns: time of the frame.
-            load: (n,) 0 where nothing touches, NaN where it is not known.
-            pose: pose at that time, if this session needs one; None: not known.
-        """
+        """Take a frame, as :meth:`PressFinder.update` does; the pose counts where this session needs one."""
 
     @property
     @abstractmethod
@@ -138,19 +128,14 @@ class Session(ABC):
 
     @abstractmethod
     def restore(self, arrays: Arrays) -> None:
-        """Go on with the presses or strokes of an equal session.
-
-        Raises:
-            ConfigurationError, KeyError, ValueError: the arrays do not fit.
-        """
+        """Go on with the arrays of an equal session; raises ConfigurationError, KeyError or ValueError at others."""
 
     def is_complete(self, share: float) -> bool:
-        """Return whether at least this share of the taxels is complete."""
         return bool((self.coverage >= 1).mean() >= share)
 
 
 class PressSession(Session):
-    """Gathers presses.
+    """Gathers presses on n taxels.
 
     Args:
         n: number of taxels.
@@ -198,14 +183,7 @@ class PressSession(Session):
 
 
 class StrokeSession(Session):
-    """Gathers strokes.
-
-    Args:
-        n: number of taxels.
-
-    Raises:
-        ConfigurationError: there are too many for a topology.
-    """
+    """Gathers strokes over n taxels; raises ConfigurationError if they are too many for a topology."""
 
     kind = "strokes"
 
@@ -243,11 +221,7 @@ class StrokeSession(Session):
 
 
 class ForceSession(Session):
-    """Gathers loads beside a reference: a force in N, and the temperature of the skin.
-
-    Args:
-        n: number of taxels.
-    """
+    """Gathers loads of n taxels beside a reference: a force in N, and the temperature of the skin."""
 
     kind = "forces"
 
@@ -298,29 +272,13 @@ _ARRAYS = "gathered/"
 
 
 def save_session(path: Path, session: Session, type_name: str, uid: npt.NDArray[np.uint64]) -> None:
-    """Write the presses or strokes of a session.
-
-    Args:
-        path: path of the file.
-        session: the session.
-        type_name: type of its taxels.
-        uid: (n,) uids of its taxels.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the presses or strokes of a session over (n,) taxels of a type; raises OSError."""
     head = {"kind": np.array(session.kind), "type_name": np.array(type_name), "uid": uid}
     write_arrays(path, _VERSION, head | {f"{_ARRAYS}{name}": array for name, array in session.arrays().items()})
 
 
 def restore_session(path: Path, session: Session, type_name: str, uid: npt.NDArray[np.uint64]) -> bool:
-    """Go on with the presses or strokes of a file; return False if there is no such file.
-
-    Args:
-        path: path of the file.
-        session: a new one.
-        type_name: type of its taxels.
-        uid: (n,) uids of its taxels.
+    """Go on with the presses or strokes of a file, in a new session; return False if there is no such file.
 
     Raises:
         ConfigurationError: it is no such file, of other taxels, or of another kind of session.

@@ -64,12 +64,10 @@ def regress(
     """Find drift, lag and play.
 
     Args:
-        point_m: (m, 3) the points of m presses.
-        motion: (m, 7) time, velocity and way of each, as of a :class:`.placing.Press`.
-        trust: (m,) the weight of each.
+        point_m, motion, trust: (m, ...) points of m presses, their motion as of a :class:`.placing.Press`, and weights.
         error_m: (n,) error of the places by chance; an error of the tool that is less certain is left alone.
         means: makes (n, k) of (m, k): the means of presses over the taxels that felt them.
-        left: makes (m, k) of (m, k): what differs from the centre of those means.
+        left: makes (m, k) of (m, k): how they differ from the centre of those means.
 
     Returns:
         The errors, (m, 3) m by which each point is off as far as it was found, and (n,) m the standard error of that in
@@ -208,11 +206,10 @@ def compare_with_layout(
     """Return what is known of the tool, with its scale and offset by a layout.
 
     Args:
-        tool: what is known.
-        position_m: (n, 3) places.
-        layout_m: (n, 3) places of the layout, in one coordinate frame; NaN where it has none.
+        tool: the errors that are known.
+        position_m, layout_m: (n, 3) places, and those of the layout, in one coordinate frame; NaN where it has none.
         modules: the taxels of each module: modules are compared as a whole.
-        error_m: (n,) standard error of all places together by what was corrected.
+        error_m: (n,) standard error of all places together by the corrections.
         is_here: whether the layout is in the coordinate frame of the points.
     """
     whole = [taxels for taxels in modules if np.isfinite(position_m[taxels] + layout_m[taxels]).all()]

@@ -35,11 +35,7 @@ class StrokeSums:
 
     @classmethod
     def empty(cls, n: int) -> Self:
-        """Make the sums of n taxels before the first frame.
-
-        Raises:
-            ConfigurationError: there are too many.
-        """
+        """Make the sums of n taxels before the first frame; raises ConfigurationError if there are too many."""
         if n > MOST_TAXELS:
             raise ConfigurationError(f"{n} taxels: a topology is found of at most {MOST_TAXELS} at a time")
         return cls(np.zeros((n, n)), np.zeros(n, np.int64))
@@ -48,11 +44,7 @@ class StrokeSums:
         return len(self.active)
 
     def add(self, load: npt.NDArray[Any]) -> None:
-        """Take one frame or many.
-
-        Args:
-            load: (n,) or (m, n): 0 where nothing touches, NaN where it is not known.
-        """
+        """Take one frame or many: (n,) or (m, n) loads, 0 where nothing touches, NaN where it is not known."""
         loads = np.nan_to_num(np.atleast_2d(np.asarray(load, np.float64)), posinf=0.0)
         np.maximum(loads, 0, out=loads)
         loads = loads[(loads > 0).any(axis=1)]
@@ -117,12 +109,7 @@ class Topology:
 
 
 def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
-    """Compute the topology of a skin from strokes.
-
-    Args:
-        sums: sums of the strokes.
-        pitch_m: distance between the nearest taxels, m.
-    """
+    """Compute the topology of a skin from strokes; the pitch is the distance between the nearest taxels, m."""
     similarity = sums.similarity()
     with np.errstate(divide="ignore"):
         far = np.where(similarity > _LEAST_SIMILAR, np.sqrt(-np.log(similarity)), np.inf)
@@ -163,14 +150,10 @@ _FAR_WEIGHT = 0.002  # weight of a way over several taxels, relative to a measur
 
 
 def unrolled_m(topology: Topology, taxels: Whole) -> Doubles:
-    """Return (k, 2) places of k taxels of one piece on a map, m, with their mean at 0. It may be the mirror image.
+    """Return (k, 2) places of (k,) linked taxels of one piece on a map, m, with mean 0. It may be the mirror image.
 
     Classical multidimensional scaling of the ways along the skin, then majorisation of the stress, in which measured
     distances count most.
-
-    Args:
-        topology: their topology.
-        taxels: (k,) linked taxels of one piece.
     """
     ways = topology.geodesics_m(taxels)
     if len(taxels) == 1:

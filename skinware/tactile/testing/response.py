@@ -59,15 +59,9 @@ class Response:
         return missing
 
     def slowly(self, load: Doubles, crept: Doubles, period_s: float) -> Doubles:
-        """Return what creep and remainder add to a block of loads.
+        """Return (m, k) what creep and remainder add to a block of (m, k) loads, one each ``period_s``.
 
-        Args:
-            load: (m, k) at even times.
-            crept: (k,) the load that the material is used to; updated.
-            period_s: between the rows.
-
-        Returns:
-            (m, k).
+        ``crept``, (k,) the load that the material is used to, is updated.
         """
         gain = 1 - np.exp(-period_s / self.creep_s)
         used_to = np.empty_like(load)
@@ -79,15 +73,7 @@ class Response:
 
 @dataclass(frozen=True)
 class Missing:
-    """Taxels without data for a while.
-
-    Attributes:
-        taxels: (k,) their numbers.
-        begin_s: from then on.
-        end_s: until then.
-        status: their status meanwhile.
-        value: value in their place; None: the last one (before the first frame: 0).
-    """
+    """Taxels without data for a while: their status meanwhile, and a value; None: the last one (0 before the first)."""
 
     taxels: Whole
     begin_s: float
@@ -98,14 +84,7 @@ class Missing:
 
 @dataclass(frozen=True)
 class Jump:
-    """A board that moved its baseline.
-
-    Attributes:
-        taxels: (k,) their numbers.
-        counts: by which the values move.
-        at_s: when.
-        suspect_s: for how long their status is ``SUSPECT``; 0 if the driver does not notice.
-    """
+    """A board that moves its baseline by counts; for how long the status is ``SUSPECT``, 0 if its driver notices nothing."""
 
     taxels: Whole
     counts: float
@@ -122,8 +101,7 @@ class Faults:
         noise: (n,) factor on its noise.
         stuck: (n,) the value that a taxel always shows; NaN: it is not stuck.
         source: (n,) the taxel whose data arrives in each one's place.
-        missing: gaps.
-        jumps: jumps.
+        missing, jumps: gaps and jumps.
     """
 
     feels: Flags
@@ -138,11 +116,9 @@ class Faults:
         return cls(np.ones(n, bool), np.ones(n), np.full(n, np.nan), np.arange(n))
 
     def jumped(self, time_s: Doubles, patch: Whole) -> tuple[Doubles | None, Flags | None]:
-        """Return (m, n) what jumps add to the values, and (m, n) which are suspect; None if there is no jump yet.
+        """Return (m, n) how jumps change the values, and (m, n) which are suspect; None if there is no jump yet.
 
-        Args:
-            time_s: (m, n_patches) of the acquisitions.
-            patch: (n,) of the taxels.
+        Acquisitions are at (m, n_patches) times; ``patch`` is (n,), of the taxels.
         """
         if not any(time_s[-1].max() >= jump.at_s for jump in self.jumps):
             return None, None

@@ -113,23 +113,14 @@ class Surface:
         return int(self.patch.max()) + 1 if len(self) else 0
 
     def geometry(self, frame: str = "world", type_name: str = "pressure") -> Geometry:
-        """Return the places of the n taxels, with the uids 0 to n - 1.
-
-        Args:
-            frame: name of the coordinate frame.
-            type_name: sensor type of the taxels.
-        """
+        """Return the places of the n taxels in a coordinate frame, with the uids 0 to n - 1."""
         n = len(self)
         places = Geometry.unknown([type_name] * n, np.arange(n, dtype=np.uint64))
         places.position_m[:], places.normal[:], places.frame[:] = self.position_m, self.normal, frame
         return places
 
     def taxels(self, some: Taxels) -> Whole:
-        """Return the numbers of some taxels.
-
-        Raises:
-            ConfigurationError: there are no such taxels.
-        """
+        """Return the numbers of some taxels; raises ConfigurationError if there are no such taxels."""
         try:
             found: Whole = np.arange(len(self))[some if isinstance(some, slice) else np.asarray(some)]
         except IndexError as error:
@@ -164,12 +155,7 @@ def grid(
 
 
 def triangles(modules: int = 1, *, patches: int = 1) -> Surface:
-    """Make a flat strip of ROBOSKIN triangles of ten taxels along x, facing +z, every second one upside down.
-
-    Args:
-        modules: number of triangles.
-        patches: number of patches, with an equal share of the triangles each.
-    """
+    """Make a flat strip of ROBOSKIN triangles of ten taxels along x, facing +z, every second one upside down."""
     places = [
         TRIANGLE_M * (-1 if number % 2 else 1) + [number * SIDE_M / 2, number % 2 * SIDE_M / np.sqrt(12)]
         for number in range(modules)

@@ -42,11 +42,7 @@ class Block:
 
     @classmethod
     def joined(cls, blocks: Sequence[Block]) -> Block:
-        """Join blocks, one after the other.
-
-        Raises:
-            ConfigurationError: there is no block.
-        """
+        """Join blocks, one after the other; raises ConfigurationError if there is none."""
         if not blocks:
             raise ConfigurationError("no frames: give a later end")
         names = [field.name for field in fields(cls)]
@@ -237,12 +233,7 @@ class World:
     ) -> None:
         """Let taxels send nothing for a while. For nothing in the first frame, begin before 0.
 
-        Args:
-            taxels: which.
-            begin_s: from then on.
-            end_s: until then.
-            status: their status meanwhile; ``Status(0)``: none.
-            value: value in their place (NaN, if the dtype has it); None: the last one.
+        Meanwhile they have a status (``Status(0)``: none), and a value (NaN, if the dtype has it); None: the last one.
         """
         dtype = np.dtype(self.dtype)
         if value is not None and not (dtype.kind == "f" or np.iinfo(dtype).min <= value <= np.iinfo(dtype).max):
@@ -261,11 +252,7 @@ class World:
             yield from block
 
     def record(self, until_s: float) -> Block:
-        """Return every frame from second 0 on, in one block.
-
-        Raises:
-            ConfigurationError: there is none.
-        """
+        """Return every frame from second 0 on, in one block; raises ConfigurationError if there is none."""
         return Block.joined(list(self.blocks(until_s)))
 
     def blocks(self, until_s: float, rows: int = _ROWS) -> Iterator[Block]:
@@ -276,13 +263,9 @@ class World:
             yield state.next_block(first, min(rows, total - first))
 
     def loads(self, time_s: Doubles) -> tuple[Doubles, Doubles]:
-        """Return the load of all gestures together, in counts.
+        """Return (m, n) the load of all gestures together, and (m, n) how much is missing as the cover sags, in counts.
 
-        Args:
-            time_s: (m, n_patches) when each patch acquires its data.
-
-        Returns:
-            (m, n) the load, and (m, n) what is missing because the cover sags.
+        ``time_s`` is (m, n_patches), when each patch acquires its data.
         """
         load = np.zeros((len(time_s), len(self.surface)))
         missing = np.zeros_like(load) if self.response.sag else load[:0]
@@ -301,16 +284,9 @@ class World:
         return load, missing
 
     def felt(self, time_s: Doubles, taxels: Taxels) -> Doubles:
-        """Return what taxels feel of all gestures at given times, in counts: the load less the sag.
+        """Return (m, k) what k taxels feel of all gestures at (m,) times, in counts: the load less the sag.
 
         It is for programs that make frames with times and noise of their own.
-
-        Args:
-            time_s: (m,).
-            taxels: k taxels.
-
-        Returns:
-            (m, k).
         """
         numbers = self.surface.taxels(taxels)
         total = np.zeros((len(time_s), len(numbers)))

@@ -30,6 +30,7 @@ from skinware.views.robot import read_robot
 from skinware_drivers.options.file import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
 from skinware_drivers.streams.ros2_map import read_map
+from skinware_drivers.virtual.physics.binding import SCENES, find_binding
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.commands import COMMANDS, PATIENCE_S, parse, refused, running
 
@@ -166,6 +167,9 @@ def test_toml_is_what_a_driver_takes(page: Path, tmp_path: Path) -> None:
         elif found.get("format") == "skinware-regions":
             file.write_text(text)
             read_regions(file)
+        elif found.get("format") == "skinware-binding":
+            file.write_text(text.replace('scene = "', f'scene = "{SCENES}/'))
+            find_binding(f"mujoco:{file}", "")
         elif found.get("format") == "skinware-columns":
             file.write_text(text)
             tips = {f"f1_{row}_{column}": np.zeros(5) for row in range(3) for column in range(4)}

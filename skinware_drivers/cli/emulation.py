@@ -126,6 +126,7 @@ class Emulation:
         self._backoff_ns = _FIRST_BACKOFF_NS
         self.send_failures: int = 0
         """Number of dropped frames."""
+        self._latest_ns = 0
 
     def run(
         self,
@@ -195,6 +196,8 @@ class Emulation:
         if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
             self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
         self._outbox += self._hardware.emit(now_ns)
+        if self._outbox:
+            self._latest_ns = max(self._latest_ns, self._clock() - self._outbox[0].time_ns)
         while self._outbox:
             try:
                 self._bus.send(self._outbox[0].identifier, self._outbox[0].payload)
@@ -207,7 +210,9 @@ class Emulation:
         return self._hardware.next_due_ns()
 
     def _totals(self) -> dict[str, int]:
-        return {**self._hardware.totals(), "send_failures": self.send_failures}
+        """Return the counts, and how late a frame was at most since the last call, in whole ms."""
+        late_ms, self._latest_ns = round(self._latest_ns / 1e6), 0
+        return {**self._hardware.totals(), "send_failures": self.send_failures, "late_ms": late_ms}
 
 
 def wait_readable(descriptors: list[int], timeout_s: float | None) -> None:

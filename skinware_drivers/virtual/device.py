@@ -35,6 +35,14 @@ class EmulatorOptions(Options, frozen=True, forbid_unknown_fields=True, kw_only=
     seed: Annotated[Count, Meta(description="seed of the touch and of the random faults")] = 0
     streaming: Annotated[bool, Meta(description="send from power-up, as if a host had started the devices")] = False
 
+    world: Annotated[
+        str, Meta(description="physics that presses the devices, instead of the pattern touch: mujoco:SCENE.xml")
+    ] = ""
+    world_speed: Annotated[
+        float, Meta(gt=0, le=1000, description="seconds of the physics in a second of the devices")
+    ] = 1.0
+    world_services: Annotated[bool, Meta(description="publish the services truth and joints of the physics")] = True
+
     lose: Annotated[Probability, Meta(description="probability that a data frame is lost")] = 0.0
     repeat: Annotated[Probability, Meta(description="probability that a data frame is sent twice")] = 0.0
     truncate: Annotated[Probability, Meta(description="probability that a data frame is cut short")] = 0.0

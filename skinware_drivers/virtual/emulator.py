@@ -174,6 +174,8 @@ class Emulator(Stage[OptionsT]):
         """Make the devices and everything else on the bus."""
         places = self.places()
         self._n_values = len(places)
+        if self.world is not None:
+            self.world.fit(self.numbers, self._n_values)
         self._press = {number: WanderingPress(self.options.seed, number, places) for number in self.numbers}
         super().power_up(now_ns)
 
@@ -191,7 +193,11 @@ class Emulator(Stage[OptionsT]):
         from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
         touched_s = (time_ns - from_ns) * 1e-9 - self.options.calm_s
         if self.options.pattern == "touch" and touched_s >= 0:
-            felt = self.feel(device, touched_s)
+            if self.world is None:
+                felt = self.feel(device, touched_s)
+            else:
+                added = self.world.added(device.number, time_ns, self._n_values)
+                felt = (values + np.rint(added).astype(np.int64)).tolist()
             values = np.clip(felt, self._each("lowest"), self._each("full_scale"))
         listed: list[int] = values.tolist()
         return listed

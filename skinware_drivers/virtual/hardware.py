@@ -163,6 +163,13 @@ def emulators_instead(medium: str) -> str:
     return f"; emulators that fit: {', '.join(fitting)}" if fitting else ""
 
 
+def name_of(emulator: type) -> str:
+    """Return the name under which an emulator is registered; if it is not, that of its module."""
+    here = f"{emulator.__module__}:{emulator.__qualname__}"
+    names = (name for name, entry in registered(EMULATORS).items() if entry.value == here)
+    return next(names, emulator.__module__.rpartition(".")[2])
+
+
 def load_emulator(name: str) -> HardwareFactory:
     """Return the emulator of a name; see :func:`skinware_drivers.loading.load`.
 

@@ -59,7 +59,7 @@ def shuffled(seed: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     return order // 12, order // 48
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [2, 3, 4, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (0, 1, 5))])
 def test_presses_losses_jumps_and_other_rates(seed: int) -> None:
     random = np.random.default_rng(seed)
     module, patch = shuffled(seed) if seed % 2 else (np.arange(N) // 12, np.arange(N) // 48)

@@ -106,6 +106,7 @@ def test_every_fault_is_found_with_its_kind_and_nothing_else(
     assert not report.faulty[others].any(), told(report, others[report.faulty[others]])
 
 
+@pytest.mark.thorough
 def test_the_evidence_says_why(faulty: tuple[npt.NDArray[np.int64], HealthReport]) -> None:
     taxels, report = faulty
     dead, weak, noisy, stuck, clipped = taxels[3].tolist()

@@ -12,6 +12,8 @@ from skinware.tactile.health_report import HealthKind, HealthReport
 from skinware.tactile.testing import grid
 from tests.tactile.skins import placed
 
+pytestmark = pytest.mark.thorough
+
 SIDE, PLATES, PASSES = 8, 7, 8
 TAXELS = SIDE * SIDE
 SURFACE = grid(PLATES, SIDE, SIDE, patches=PLATES)

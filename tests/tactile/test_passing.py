@@ -19,7 +19,10 @@ def passes(way: Way, speeds_m_s: tuple[float, ...], sigmas_m: tuple[float, ...])
     return [FingerPass(way, speed, lane, sigma, seed=0) for speed in speeds_m_s for lane in lanes for sigma in sigmas_m]
 
 
-@pytest.mark.parametrize("way", WAYS)
+MORE = [pytest.param(way, marks=pytest.mark.thorough) for way in WAYS[1:]]
+
+
+@pytest.mark.parametrize("way", [WAYS[0], *MORE])
 def test_identities_are_kept(way: Way) -> None:
     found = [told(one) for one in passes(way, (0.2, 1.0), (0.004, 0.006))]
     outcomes = Counter(one.outcome for one in found)

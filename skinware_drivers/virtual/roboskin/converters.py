@@ -146,7 +146,7 @@ class Converters:
             return ahead.popleft()
         ahead.clear()
         self._ahead_version = self._version
-        steps = np.arange(_AHEAD)
+        steps = np.arange(_AHEAD if self._touch.is_known_ahead else 1)
         ahead.extend(self._acquisitions(time_ns + steps * period_ns, cycle + steps, {}))
         return ahead.popleft()
 

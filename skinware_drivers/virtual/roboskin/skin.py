@@ -20,7 +20,7 @@ from skinware_drivers.virtual.events import Event, FrameDamage, Half
 from skinware_drivers.virtual.hardware import EventLog, Point, Pressing
 from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import TriangleState
-from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
+from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES
 from skinware_drivers.virtual.roboskin.mtb import Mtb3, Mtb4
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.touch import PressedSkin, WireSource, cycle_pattern
@@ -55,7 +55,9 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     ) -> None:
         super().__init__(options, log=log)
         self._source = cycle_pattern if source is None and options.pattern == "cycle" else source
-        self.skin = PressedSkin(options)
+        self.skin = PressedSkin(options, self.world)
+        if self.world is not None:
+            self.world.fit(options.boards, TRIANGLES * CHANNELS)
         n_boards = len(options.boards)
         self._phases = np.random.default_rng([options.seed, n_boards]).uniform(0.02, 1, n_boards).tolist()
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,9 @@ from skinware.tactile.testing import ARM_FRAME, Wander, World, arm, arm_path, re
 from skinware_drivers.virtual.hardware import Point, Pressing
 from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, ArrayI
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
+
+if TYPE_CHECKING:  # needs MuJoCo
+    from skinware_drivers.virtual.physics.world import World as PhysicalWorld
 
 WireSource = Callable[[int, int, int, int], Sequence[int]]
 """(board address, triangle, cycle, time in ns) -> the 12 values on the wire, 0-255, instead of felt ones."""
@@ -52,16 +56,21 @@ _SENSORS = TRIANGLES * CHANNELS
 class PressedSkin:
     """The skin of all boards, and the presses on it.
 
+    Args:
+        physics: a world that presses it, too, instead of the wandering fingers.
+
     Raises:
         ConfigurationError: the file of the option ``stage`` cannot be used.
 
     Attributes:
         origin_ns: beginning of the stage file's time.
         version: changes when the touch from now on does, other than with time.
+        physics: the world that presses it; its touch is known only now.
     """
 
-    def __init__(self, options: EmulatedRoboskinOptions) -> None:
+    def __init__(self, options: EmulatedRoboskinOptions, physics: PhysicalWorld | None = None) -> None:
         self.version: int = 0
+        self.physics = physics
         self._options = options
         numbers = [address - _FIRST_BOARD for address in options.boards]
         self._paths = [arm_path(number) for number in numbers]
@@ -126,7 +135,8 @@ class PressedSkin:
         if finger is not None:
             self._world.gestures.remove(finger)
             self.version += 1
-        if time_ns is not None and self._options.pattern == "touch" and not self._options.stage:
+        wanders = self._options.pattern == "touch" and not self._options.stage and self.physics is None
+        if time_ns is not None and wanders:
             random = np.random.default_rng([self._options.seed, ordinal, 5])
             path = np.roll(self._paths[ordinal], -int(random.integers(len(self._paths[ordinal]))), axis=0)
             finger = Wander(
@@ -149,6 +159,8 @@ class PressedSkin:
         felt = self._world.felt(times_ns / NS_PER_S, taxels)
         if self._stage.gestures:
             felt += self._stage.felt(self._on_stage(times_ns), taxels)
+        if self.physics is not None:
+            felt += np.rint(self.physics.added(self._options.boards[ordinal], int(times_ns[0]), _SENSORS))
         return felt.astype(np.int64).reshape(-1, TRIANGLES, CHANNELS)
 
     def _on_stage(self, times_ns: ArrayI) -> npt.NDArray[np.float64]:
@@ -209,6 +221,11 @@ class Touch:
     def version(self) -> int:
         """Changes when the touch from now on does, other than with time."""
         return 0 if self._skin is None else self._skin.version
+
+    @property
+    def is_known_ahead(self) -> bool:
+        """Whether the touch of coming moments is known: no physics decides it."""
+        return self._skin is None or self._skin.physics is None
 
     def capacitances(self, times_ns: ArrayI, cycles: ArrayI, cdc_offset: ArrayI, *, fingertip: bool) -> ArrayI:
         """Return (n, 16, 12) readings of the converters, 1-65534.

@@ -1,0 +1,1 @@
+"""Physics under emulated devices: a MuJoCo scene presses their taxels. Needs the extra ``mujoco``."""

@@ -1,0 +1,133 @@
+"""The services of a world: ``truth``, which knows every contact, and ``joints``, which moves and obeys."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from skinware.memory.schema import Column
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.service import ServiceWriter
+from skinware_drivers.virtual.physics.body import Scene
+
+TRUTH, JOINTS = "truth", "joints"
+RATE_HZ = 100
+_MOST = 32
+_LONGEST_NAME = 64
+
+
+class WorldServices:
+    """Publish what is true in a scene and where its joints are, 100 times a second, and take commands.
+
+    Raises:
+        NameInUse: another world publishes here.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._due_ns = 0
+        n, joints, actuators = len(scene.modules), len(scene.joints), len(scene.actuators)
+
+        def floats(shape: tuple[int, ...], unit: str, description: str) -> Column:
+            return Column(np.dtype("<f8"), shape, unit, description)
+
+        self._truth = ServiceWriter(
+            TRUTH,
+            {
+                "count": Column(np.dtype("<u4"), (1,), "", "number of contacts; later rows are old"),
+                "point_m": floats((_MOST, 3), "m", "of each contact, in the frame of its module's body"),
+                "normal_n": floats((_MOST,), "N", "of each"),
+                "shear_n": floats((_MOST, 3), "N", "of each, on the module"),
+                "slip_m_s": floats((_MOST,), "m/s", "speed of the other body along the surface"),
+                "module": Column(np.dtype("<u4"), (_MOST,), "", "of each, a row of module_name"),
+                "module_n": floats((n,), "N", "normal force on each module"),
+                "force_n": floats((1,), "N", "normal force on all modules"),
+                "scene_s": floats((1,), "s", "time of the scene"),
+                "lag_s": floats((1,), "s", "by which the physics is behind"),
+            },
+            {"module_name": _texts([module.name for module in scene.modules])},
+            rate_hz=RATE_HZ,
+            description="contacts of a simulated scene",
+        )
+        self._joints = ServiceWriter(
+            JOINTS,
+            {
+                "position": floats((max(1, joints),), "", "of each joint, rad or m"),
+                "velocity": floats((max(1, joints),), "", "of each joint, rad/s or m/s"),
+                "target": floats((max(1, actuators),), "", "of each actuator"),
+            },
+            {
+                "joint_name": _texts(scene.joints),
+                "actuator_name": _texts(scene.actuators),
+                "pose_name": _texts(list(scene.poses)),
+            },
+            rate_hz=RATE_HZ,
+            description="joints of a simulated scene",
+            operations={"move": self.move, "hold": self.hold},
+        )
+        self._joint_rows = [(int(model_q), int(model_v)) for model_q, model_v in _addresses(scene)]
+
+    def serve(self, time_ns: int) -> None:
+        """Carry out commands, and publish what is due.
+
+        Args:
+            time_ns: of the physics, CLOCK_MONOTONIC ns.
+        """
+        waiting = [*self._truth.answer_requests(), *self._joints.answer_requests()]
+        if waiting or time_ns >= self._due_ns:
+            self._publish(time_ns)
+            self._due_ns = time_ns + NS_PER_S // RATE_HZ
+        for request in waiting:
+            request.reply(position=self._truth.position)
+
+    def move(self, pose: str = "", targets: dict[str, float] | None = None, seconds: float = 0.0) -> None:
+        """Move to a pose, or actuators to targets, within a time.
+
+        Raises:
+            ValueError: there is no such pose.
+            ConfigurationError: there is no such actuator, or a number is none.
+        """
+        if pose and pose not in self._scene.poses:
+            raise ValueError(f"there is no pose {pose!r}; there are {', '.join(self._scene.poses)}")
+        self._scene.move({**(self._scene.poses[pose] if pose else {}), **(targets or {})}, seconds)
+
+    def hold(self) -> None:
+        """Stop every movement: actuators keep the targets that they have now."""
+        self._scene.hold()
+
+    def close(self) -> None:
+        """Take the services away. Idempotent."""
+        self._truth.close()
+        self._joints.close()
+
+    def _publish(self, time_ns: int) -> None:
+        scene = self._scene
+        touches = scene.touching()
+        columns = self._truth.begin(from_last=True)
+        columns["module_n"][:] = 0
+        for touch in touches:
+            columns["module_n"][touch.module] += touch.normal_n
+        columns["force_n"][0] = columns["module_n"].sum()
+        for row, touch in enumerate(touches[:_MOST]):
+            columns["point_m"][row], columns["normal_n"][row] = touch.point_m, touch.normal_n
+            columns["shear_n"][row], columns["slip_m_s"][row] = touch.shear_n, touch.slip_m_s
+            columns["module"][row] = touch.module
+        columns["count"][0] = min(len(touches), _MOST)
+        columns["scene_s"][0] = scene.time_s
+        columns["lag_s"][0] = (now_ns() - time_ns) / NS_PER_S
+        self._truth.commit(time_ns)
+        columns = self._joints.begin(from_last=True)
+        for row, (position, velocity) in enumerate(self._joint_rows):
+            columns["position"][row] = scene.data.qpos[position]
+            columns["velocity"][row] = scene.data.qvel[velocity]
+        columns["target"][: len(scene.actuators)] = scene.data.ctrl
+        self._joints.commit(time_ns)
+
+
+def _texts(names: list[str]) -> Any:
+    return np.array([name.encode()[:_LONGEST_NAME] for name in names] or [b""], f"|S{_LONGEST_NAME}")
+
+
+def _addresses(scene: Scene) -> Any:
+    return zip(scene.model.jnt_qposadr, scene.model.jnt_dofadr, strict=True)

@@ -1,32 +1,6 @@
-"""Run each sensor type of a driver through a chain of stages, which a file lists in their order.
+"""Run each sensor type of a driver through a chain of stages, which a TOML file lists in their order.
 
-The file is TOML; every key of a stage except ``stage`` is optional::
-
-    format = "skinware-chain"
-    version = 1
-
-    [[stage]]
-    stage = "baseline"          # 0 = no touch: see BaselineSettings
-    tau_s = 30.0
-
-    [[stage]]
-    stage = "curve"             # counts to a unit: see skinware.tactile.curves
-    file = "curves.toml"
-
-    [[stage]]
-    stage = "filter"            # lowpass, mean or median
-    types = ["pressure"]        # default: all for which the stage can be made
-    method = "median"
-
-    [[stage]]
-    stage = "scaler"            # each taxel to one range
-
-    [[stage]]
-    stage = "amplifier"         # gain * value ** exponent + offset
-    exponent = 0.5
-
-``thermal`` before a baseline takes off what temperature does: see skinware.tactile.thermal. ``field`` before a baseline
-and ``vector`` behind it are for taxels with three axes: see skinware.tactile.vectors.
+docs/tactile/baselines.md has examples of the file; the keys of a stage are its settings.
 """
 
 from __future__ import annotations
@@ -45,14 +19,84 @@ from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
-from skinware.tactile.baseline import Baseline
-from skinware.tactile.baseline_stage import RESTLESS, BaselineStage, BaselineStageSettings
+from skinware.tactile.baseline import Baseline, Calm
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
-from skinware.tactile.rule import UNUSABLE
+from skinware.tactile.rule import UNUSABLE, BaselineSettings
 from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
 from skinware.tactile.thermal import ThermalSettings
 from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of
 from skinware.toml_text import TomlText
+
+RESTLESS = (TEMPERATURE, "acceleration_", "angular_rate_")
+"""Beginnings of the names of types that have no rest to go back to."""
+
+
+class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_field="stage", tag="baseline"):
+    """Settings of a baseline as a stage: 0 = no touch; the unit stays.
+
+    Attributes:
+        types: the sensor types that it is for; None: all for which it can be made.
+    """
+
+    types: tuple[str, ...] | None = None
+
+    def stage(self, taxels: Taxels) -> BaselineStage:
+        name, unit = taxels.type.name, taxels.type.unit
+        if name.startswith(RESTLESS):
+            raise ConfigurationError(f"a {name} has no rest to return to")
+        if name == "proximity" and unit == "m":
+            raise ConfigurationError(
+                "a proximity in m falls when something comes near; baselines are for rising values"
+            )
+        given = {field: getattr(self, field) for field in BaselineSettings.__struct_fields__}
+        return BaselineStage(taxels, BaselineSettings(**given))
+
+
+class BaselineStage(Stage):
+    """Takes the baselines of n taxels away.
+
+    Attributes:
+        baseline: the baselines.
+        before: the taxels as they come in.
+        given: (n,) float32, the values of the newest frame as they came in.
+        calm: the same, calmed; None before the first frame.
+    """
+
+    name = "baseline"
+
+    def __init__(self, taxels: Taxels, settings: BaselineSettings) -> None:
+        self.before = taxels
+        before = taxels.type
+        span = before.maximum - before.minimum
+        calmed = replace(before, minimum=-span if taxels.signed else 0.0, maximum=span)
+        super().__init__(replace(taxels, type=calmed, resolution=0.0))
+        self.baseline = Baseline(
+            taxels.module,
+            taxels.patch,
+            settings,
+            resolution=taxels.resolution,
+            signed=taxels.signed,
+            common=taxels.common,
+            limits=(before.minimum, before.maximum),
+        )
+        self.given: Floats = np.full(len(taxels), np.nan, np.float32)
+        self.calm: Calm | None = None
+
+    @property
+    def touched(self) -> Flags:
+        """(n,) bool, which taxels are touched in the newest frame."""
+        return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
+
+    def step(self, signal: Signal) -> None:
+        self.given = signal.values
+        self.calm = calm = self.baseline.update(
+            signal.time_ns, signal.values, signal.usable, jumped=signal.jumped, bears=signal.bears
+        )
+        signal.deviation = signal.values - calm.baseline
+        signal.values = calm.value
+        signal.forced |= calm.forced
+        signal.unknown |= np.isnan(calm.baseline)
+
 
 FORMAT, VERSION = "skinware-chain", 1
 
@@ -75,12 +119,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ChainSettings:
-    """The settings of a chain.
-
-    Args:
-        stages: settings of its stages, in their order.
-        place: file and line of a stage, for messages.
-    """
+    """The settings of the stages of a chain, in their order; ``place`` gives file and line of a stage, for messages."""
 
     def __init__(
         self, stages: Sequence[AnySettings], place: Callable[[int], str] = lambda number: f"stage {number + 1}"
@@ -90,7 +129,6 @@ class ChainSettings:
 
     @classmethod
     def calm(cls) -> Self:
-        """Return the settings of a baseline and nothing else."""
         return cls([BaselineStageSettings()])
 
     @classmethod
@@ -250,7 +288,7 @@ class Chain:
         return restored
 
     def fits(self, state: ChainState) -> bool:
-        """Whether its baselines see the same values as those of a state did."""
+        """Return whether its baselines see the same values as those of a state did."""
         return state.fingerprint == self._fingerprint
 
     def uid(self, type_name: str) -> npt.NDArray[np.uint64]:
@@ -274,13 +312,10 @@ class Chain:
         return {name: stage.baseline for name, stage in self.baseline_stages.items()}
 
     def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: Bytes) -> None:
-        """Take the next frame through all stages.
+        """Take the next frame of the driver through all stages.
 
-        Args:
-            frame: frame of the driver.
-            values: (n_sensors,) float32, filled with the output.
-            status: (n_sensors,) uint8, filled with the frame's, ``SUSPECT`` where a baseline was moved by force, and
-                ``NEVER_SEEN`` where a stage has no result yet.
+        Fills (n_sensors,) float32 values with the output; and (n_sensors,) uint8 status with that of the frame,
+        ``SUSPECT`` where a baseline was moved by force, and ``NEVER_SEEN`` where a stage has no result yet.
         """
         status[:] = frame.status
         if any(stage.table.warms for stage in self.curve_stages.values()):

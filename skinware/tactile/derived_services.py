@@ -10,6 +10,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import Generic, Self, TypeVar
 
 import numpy as np
@@ -71,12 +72,12 @@ class DerivedService(ABC, Generic[WriterT]):
             self._writer.close()
         self._writer = None
 
-    def _open(self, make: Callable[[str], WriterT]) -> None:
+    def _open(self, make: Callable[..., WriterT]) -> None:
         """Make the writer, under the first name that is free; raises NameInUse if none is."""
         try:
-            self._writer = make(self._name)
+            self._writer = make(name=self._name, **self._options)
         except NameInUse:
-            self._writer = make(f"{self._driver}-{self._name}")
+            self._writer = make(name=f"{self._driver}-{self._name}", **self._options)
 
     @contextmanager
     def _or_none(self) -> Iterator[None]:
@@ -112,9 +113,7 @@ class Loads:
 
     def usable(self, status: Bytes) -> Flags:
         """Return (n,) bool, which taxels have values of this frame, of (n_sensors,) status."""
-        usable: Flags = (status[self._indexes[0]] & UNUSABLE) == 0
-        for index in self._indexes[1:]:
-            usable &= (status[index] & UNUSABLE) == 0
+        usable: Flags = np.logical_and.reduce([(status[index] & UNUSABLE) == 0 for index in self._indexes])
         return usable
 
     def values(self, values: Floats) -> Floats:
@@ -192,20 +191,12 @@ class CalmContacts(DerivedService[ContactsWriter]):
             self._writer.restructure(structure, neighbours=beside)
             return
         super().close()
-        options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
         self._open(
-            lambda name: ContactsWriter(
-                structure, type_name, driver=self._driver, neighbours=beside, name=name, **options
-            )
+            partial(ContactsWriter, structure, type_name, driver=self._driver, neighbours=beside, rate_hz=rate_hz)
         )
 
     def publish(self, values: Floats, status: Bytes, acquired_ns: int) -> None:
-        """Find the contacts of the next frame, and publish them.
-
-        Args:
-            values, status: (n_sensors,) output of the chain; sensors without a value of this frame touch nothing.
-            acquired_ns: of the frame.
-        """
+        """Find the contacts in the (n_sensors,) output of the chain, and publish them."""
         if self._writer is None or self._loads is None:
             return
         usable, loads = self._loads.usable(status), self._loads.values(values)
@@ -244,18 +235,8 @@ class CalmMotion(DerivedService[MotionWriter]):
         if self.contacts is None:
             return
         source = self.contacts.source
-        options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
-        self._open(
-            lambda name: MotionWriter(
-                chain.structure,
-                source.type_name,
-                self._regions,
-                source.frames,
-                driver=self._driver,
-                name=name,
-                **options,
-            )
-        )
+        given = chain.structure, source.type_name, self._regions, source.frames
+        self._open(partial(MotionWriter, *given, driver=self._driver, rate_hz=rate_hz))
 
     def publish(self, contacts: ContactSet, values: Floats, acquired_ns: int) -> None:
         if self._writer is not None:
@@ -289,7 +270,7 @@ class CalmHealth(DerivedService[HealthWriter]):
         elif self._writer is not None:
             self._writer.restructure(chain.structure)
         else:
-            self._open(lambda name: HealthWriter(chain.structure, self._driver, name=name, **self._options))
+            self._open(partial(HealthWriter, chain.structure, self._driver))
 
     def step(self, status: Bytes, acquired_ns: int) -> None:
         """Take in what the chain made of the next frame; mark sensors with a fault in (n_sensors,) status."""

@@ -1,12 +1,5 @@
 """Judge all sensors of a driver; publish and read it: the service ``health``, once a second, with the reasons.
 
-::
-
-    with HealthReader(namespace="calm", timeout_s=10) as health:
-        report = health.read().report
-        for position in np.flatnonzero(report.faulty):
-            print(health.source.uid[position], report.evidence(position))
-
 Columns of a sample: those of :data:`skinware.tactile.health_report.COLUMNS`, of all sensors of the driver in the order
 of its frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns:
 ``sensor_uid``, ``sensor_type``, and the name of the ``driver``.
@@ -23,8 +16,7 @@ import numpy as np
 from skinware.errors import ConfigurationError
 from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Flags, rows_of
-from skinware.tactile.baseline_stage import BaselineStage
-from skinware.tactile.chain import HEALTH, Chain, ChainState
+from skinware.tactile.chain import HEALTH, BaselineStage, Chain, ChainState
 from skinware.tactile.health import Health
 from skinware.tactile.health_report import COLUMNS, NOTHING, HealthReport
 from skinware.tactile.source_service import (
@@ -68,13 +60,9 @@ class HealthReader(SourceReader[HealthSample]):
 
 
 class HealthWriter(SourceWriter):
-    """Publishes the health of the sensors of a driver.
+    """Publishes the health of the sensors of a driver, whose name is for readers.
 
-    Args:
-        structure: of the driver.
-        driver: its name.
-        name: of the service.
-        options: namespace and group, as for :class:`skinware.service.ServiceWriter`.
+    Options are namespace and group, as for :class:`skinware.service.ServiceWriter`.
     """
 
     form = _FORM
@@ -88,11 +76,7 @@ class HealthWriter(SourceWriter):
         super().__init__(source, name, f"health of the sensors of {driver}", **given)
 
     def publish(self, reports: Mapping[str, HealthReport], acquired_ns: int) -> None:
-        """Publish the present reports.
-
-        Args:
-            reports: by type of sensors; nothing is known of the others.
-            acquired_ns: of the newest frame, CLOCK_MONOTONIC ns.
+        """Publish the present reports by type of sensors; nothing is known of the others.
 
         Raises:
             StructureError: the driver has no such sensors.
@@ -110,22 +94,13 @@ class HealthWriter(SourceWriter):
         self._service.commit(acquired_ns)
 
     def restructure(self, structure: Structure) -> None:
-        """Go on with other sensors, as a new generation.
-
-        Raises:
-            NamespaceError: shared memory is full; the old generation then goes on.
-        """
+        """Go on with other sensors, as a new generation; raises NamespaceError, and then the old one goes on."""
         self._restructure(Source(self.source.driver, uid=structure.sensor_uid, type_id=structure.sensor_type))
         self._structure = structure
 
 
 class ChainHealth:
-    """Follows the health of all types of a chain that have a baseline and that a touch only raises.
-
-    Args:
-        chain: the chain whose values it judges.
-        driver: name of the driver, for messages.
-    """
+    """Follows the health of all types of a chain that have a baseline and that a touch only raises."""
 
     def __init__(self, chain: Chain, driver: str) -> None:
         self._chain = chain
@@ -166,11 +141,7 @@ class ChainHealth:
         return found
 
     def restore(self, state: ChainState) -> None:
-        """Go on with what was known of these sensors, if the baselines saw the same values then.
-
-        Raises:
-            ConfigurationError: that is no such state.
-        """
+        """Go on with what was known, if the baselines saw the same values then; raises ConfigurationError."""
         for name, (_, health) in self._watched.items():
             known, rows = state.of(self._chain, name, HEALTH)
             if known and self._chain.fits(state):

@@ -33,10 +33,7 @@ class Shape:
 
 
 def shapes_of(
-    module: npt.NDArray[np.integer],
-    kind: Sequence[str],
-    position_m: Doubles,
-    normal: Doubles,
+    module: npt.NDArray[np.integer], kind: Sequence[str], position_m: Doubles, normal: Doubles
 ) -> dict[int, Shape]:
     """Return the shapes of modules, by number, where the places of all of their taxels are known.
 
@@ -82,12 +79,12 @@ class Pose:
     origin_m: Doubles
 
     def places_m(self, shape: Shape) -> Doubles:
-        """(k, 3) the places of the taxels of a shape."""
+        """Return (k, 3) the places of the taxels of a shape."""
         places: Doubles = shape.place_m @ self.rotation.T + self.origin_m
         return places
 
     def normals(self, shape: Shape) -> Doubles:
-        """(k, 3) their normals."""
+        """Return (k, 3) their normals."""
         normals: Doubles = shape.normal @ self.rotation.T
         return normals
 

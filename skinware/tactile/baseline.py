@@ -1,12 +1,5 @@
 """Follow baselines: what each taxel would read if nothing touched it, while the hardware drifts and contacts last.
 
-::
-
-    baseline = Baseline.of(reader.structure, "pressure")
-    for frame in reader.in_order():
-        calm = baseline.take(frame)
-        print(calm.value[calm.touched])     # 0 = no touch, in the type's unit
-
 One question decides everything: how much of this could be drift? Each taxel has an offset and knows how uncertain it
 is. A value that is above the offset by more than noise and uncertainty explain is a touch. Under a touch the offset is
 predicted from what the patch has in common, and its uncertainty grows by the drift that was measured at rest. A touch
@@ -277,14 +270,9 @@ class Baseline:
         return {name: self._arrays[name].copy() for name in _LEARNED}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]], rows: npt.NDArray[np.integer]) -> int:
-        """Go on with what another baseline had learned, contacts included.
+        """Go on with what another baseline of m taxels had learned, contacts included; return how many are ready now.
 
-        Args:
-            state: what ``state`` returned, of m taxels.
-            rows: (n,) where each taxel stands there; -1: nowhere.
-
-        Returns:
-            The number of taxels that are ready now.
+        (n,) ``rows`` say where each taxel stands there; -1: nowhere.
 
         Raises:
             ConfigurationError: that is no such state.

@@ -11,14 +11,7 @@ import numpy.typing as npt
 
 from skinware.driver_service import DriverReader, DriverWriter
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import (
-    BadServiceFile,
-    Overrun,
-    Paused,
-    ServiceNotFound,
-    ServiceTimeout,
-    StructureChanged,
-)
+from skinware.errors import BadServiceFile, Overrun, Paused, ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.status import PatchState, Status

@@ -1,12 +1,4 @@
-"""Find contacts, touched taxels that hang together, measure them, and follow them from frame to frame.
-
-::
-
-    contacts = Contacts(len(geometry), neighbours(geometry), geometry)
-    for time_ns, value, touched in ...:
-        for contact in contacts.update(value, touched, time_ns):
-            print(contact.id, contact.cop_m, contact.load, contact.taxels)
-"""
+"""Find contacts, touched taxels that hang together, measure them, and follow them from frame to frame."""
 
 from __future__ import annotations
 
@@ -330,13 +322,7 @@ class Contacts:
             of_cut = found["n"] * top / np.log(top / self._least)
         return np.where(cut > 0, np.where(share <= _MOST_CUT, of_cut, np.nan), whole)
 
-    def _frame_of(
-        self,
-        taxels: Whole,
-        contact: Whole,
-        load: Doubles,
-        peak: Doubles,
-    ) -> Whole:
+    def _frame_of(self, taxels: Whole, contact: Whole, load: Doubles, peak: Doubles) -> Whole:
         """(count,) the frame in which each contact has its largest value; -1 if no place is known."""
         placed = self._frame[taxels] >= 0
         if not placed.all():  # the largest value at a known place
@@ -348,13 +334,7 @@ class Contacts:
         return frame
 
 
-def _largest(
-    taxels: Whole,
-    contact: Whole,
-    load: Doubles,
-    count: int,
-    listed: Flags,
-) -> tuple[Whole, Whole, Doubles]:
+def _largest(taxels: Whole, contact: Whole, load: Doubles, count: int, listed: Flags) -> tuple[Whole, Whole, Doubles]:
     """Those of the largest contacts; one that was listed stays unless another is clearly larger."""
     loads = np.bincount(contact, load, count)
     loads *= np.where(np.bincount(contact, listed, count) > 0, _CLEARLY, 1.0)

@@ -1,12 +1,5 @@
 """Publish and read the service ``contacts``: what touches a skin, frame by frame, for programs in any language.
 
-::
-
-    with ContactsReader(namespace="calm", timeout_s=10) as contacts:
-        for sample in contacts:
-            for contact in sample:
-                print(contact.id, contact.load, contact.cop_m, contact.taxels)
-
 Columns of a sample: those of :data:`skinware.tactile.contacts.COLUMNS`, of 64 rows each. ``count`` of them are filled,
 the oldest contact first; in the others ``id``, ``n`` and ``kind`` are 0, ``frame`` is -1 and numbers are NaN.
 ``beyond`` counts the contacts that found no row, ``contact_of`` gives each taxel the row of its contact. Static
@@ -135,15 +128,8 @@ class ContactsWriter(SourceWriter):
     def publish(self, value: npt.NDArray[Any], touched: Flags, acquired_ns: int, **more: Unpack[More]) -> ContactSet:
         """Find the contacts of the next frame, and publish them.
 
-        Args:
-            value: (n,) calmed values of the n sensors; 0 = no touch.
-            touched: (n,) bool.
-            acquired_ns: of the frame, CLOCK_MONOTONIC ns.
-            more: onset, clipped and uncertainty, as for :meth:`.Contacts.update`.
-
-        Raises:
-            ConfigurationError: not of these sensors.
-            Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
+        Arguments as of :meth:`.Contacts.update`; raises ConfigurationError as that, and as
+        :meth:`skinware.service.ServiceWriter.begin`.
         """
         found = self._contacts.update(value, touched, acquired_ns, **more)
         columns = self._service.begin()

@@ -1,25 +1,7 @@
 """Read and apply force curves, which give values a unit of force or pressure, per type or per taxel.
 
-The file is TOML, keyed like a geometry::
-
-    format = "skinware-curves"
-    version = 1
-
-    [[curve]]
-    type = "pressure"
-    uid = [0x70500, 0x70501]    # default: all of the type that no other curve names
-    from_unit = "counts"
-    unit = "Pa"
-    x = [0.0, 12.0, 40.0, 180.0]        # rising, at most 8
-    y = [0.0, 900.0, 4500.0, 60000.0]   # not falling; beyond its ends a curve is level
-    hysteresis = 0.08                   # for information
-    play = 9.0                          # a follower with this play counts by lag: rising and falling loads differ
-    lag = 20.0
-    creep_s = 30.0                      # what creeps in this time counts by creep
-    creep = -12.0
-    temperature = -0.9                  # in the unit, for each of from_unit and kelvin above at_c
-    at_c = 25.0
-    error = [40.0, 0.03]                # standard deviation at 0, and its growth with the result
+docs/tactile/baselines.md has an example of their file, which is TOML; the keys of a curve are the attributes of
+:class:`Curve`.
 """
 
 from __future__ import annotations

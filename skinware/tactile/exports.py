@@ -30,23 +30,13 @@ class IcubPart(NamedTuple):
 
 
 def icub_contacts(
-    contacts: ContactSet,
-    geometry: Geometry,
-    part: IcubPart,
-    *,
-    newtons_per_load: float | None = ICUB_NEWTONS_PER_COUNT,
+    contacts: ContactSet, geometry: Geometry, part: IcubPart, *, newtons_per_load: float | None = ICUB_NEWTONS_PER_COUNT
 ) -> list[list[Any]]:
     """Return contacts as the skin manager of the iCub sends them, each a list of eight.
 
     ``[[id, body part, link, skin part], centre of pressure, force, moment, geometric centre, normal, taxels,
     pressure]``: vectors of three, in m and N; the moment is 0; pressure is the mean value of the taxels. Unlike there,
-    normals are of length 1, and an id lasts as long as its contact.
-
-    Args:
-        contacts: contacts of one frame.
-        geometry: places of the n taxels.
-        part: their part of the robot.
-        newtons_per_load: force per load where it is not known; None: NaN.
+    normals are of length 1, and an id lasts as long as its contact. ``geometry`` has the places of the n taxels.
 
     Raises:
         ConfigurationError: the places are of another number of taxels.
@@ -73,12 +63,8 @@ def tactile_msgs_contacts(
 ) -> list[dict[str, Any]]:
     """Return contacts with the fields of ``tactile_msgs/TactileContact`` of ROS 2.
 
-    The name is the identity; the torque is that of the force about the origin of the frame.
-
-    Args:
-        contacts: contacts of one frame.
-        stamp_ns: time of the frame on the clock of ROS, ns.
-        newtons_per_load: force per load where it is not known; None: NaN.
+    The name is the identity; the torque is that of the force about the origin of the frame. ``stamp_ns`` is the time of
+    the frame on the clock of ROS, ns.
     """
     seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
     messages = []

@@ -1,15 +1,5 @@
 """Judge the health of taxels by what they showed in use: stuck, noisy, dead, shorted and other :class:`HealthKind`.
 
-::
-
-    baseline, health = Baseline(module, patch), Health(module, geometry)
-    for time_ns, values in ...:
-        calm = baseline.update(time_ns, values)
-        health.update(time_ns, values, calm)
-    report = health.report()
-    for taxel in np.flatnonzero(report.faulty):
-        print(taxel, report.evidence(taxel, "counts"))
-
 An untouched taxel looks like one that feels nothing, unless both its sides are touched: a thing that presses two taxels
 presses those between them. In a contact that falls off to its edges as a bell does, a taxel in the middle shows at
 least the geometric mean of both sides. That is its *due*. Taxels at a corner lie between no two others: only a wipe
@@ -148,13 +138,7 @@ class Health:
         )
 
     def update(self, time_ns: int, values: npt.ArrayLike, calm: Calm) -> None:
-        """Take the next frame in.
-
-        Args:
-            time_ns: of the frame, as for the baseline.
-            values: (n,) as for the baseline, in the unit of the type.
-            calm: what the baseline made of it.
-        """
+        """Take the next frame in: when it was, its (n,) values, and what the baseline made of them."""
         given = np.asarray(values, np.float32)
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
@@ -253,11 +237,7 @@ class Health:
         }
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]], rows: npt.NDArray[np.integer]) -> None:
-        """Go on with what was known of taxels before.
-
-        Args:
-            state: what ``state`` returned, of m taxels.
-            rows: (n,) where each taxel stands there; -1: nowhere.
+        """Go on with the state of m taxels, in which (n,) ``rows`` say where each taxel stands; -1: nowhere.
 
         Raises:
             ConfigurationError: that is no such state.

@@ -97,14 +97,10 @@ COLUMNS: Columns = {
 
 
 def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
-    """Return the motion of regions, from the contacts of a frame.
+    """Return the motion of regions, from the contacts of a frame and (n,) calmed values.
 
-    The velocity of a region leaves out contacts in other coordinate frames than the one with most of its load.
-
-    Args:
-        regions: by name, positions among the n taxels: a slice or (m,) int64, as :meth:`.Regions.of` gives them.
-        contacts: contacts of the frame.
-        value: (n,) calmed values, as for :meth:`.Contacts.update`.
+    The velocity of a region leaves out contacts in other coordinate frames than the one with most of its load. Regions
+    are, by name, positions among the n taxels: a slice or (m,) int64, as :meth:`.Regions.of` gives them.
     """
     columns = rows_of(COLUMNS, len(regions))
     found: Arrays = {name: np.zeros(shape, dtype) for name, (dtype, shape, *_) in columns.items()}

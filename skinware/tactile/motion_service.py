@@ -1,12 +1,5 @@
 """Publish and read the service ``motion``: how everything that touches a region of a skin moves, frame by frame.
 
-::
-
-    with MotionReader(namespace="calm", timeout_s=10) as motion:
-        for sample in motion:
-            for region in sample:
-                print(region.name, region.load, region.speed_m_s, region.direction)
-
 Columns of a sample: those of :data:`skinware.tactile.motion.COLUMNS`, a row for each region. Static columns:
 ``region_name``, ``frame_name``, ``driver``, ``type_name`` and ``type_unit``.
 """
@@ -68,16 +61,9 @@ class MotionReader(SourceReader[MotionSample]):
 
 
 class MotionWriter(SourceWriter):
-    """Publishes the motion of a driver's regions.
+    """Publishes the motion of regions of a driver, by its contacts, whose coordinate frames have these names.
 
-    Args:
-        structure: of the driver.
-        type_name: which sensors.
-        regions: regions that may have such sensors.
-        frames: names of the coordinate frames of its contacts.
-        driver: its name, for readers.
-        name: of the service.
-        options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`.
+    Other arguments are as for :class:`skinware.tactile.contacts_service.ContactsWriter`.
 
     Raises:
         StructureError: the driver has no such sensors.
@@ -104,15 +90,9 @@ class MotionWriter(SourceWriter):
         super().__init__(source, name, f"motion over regions of {driver or 'a skin'}, {type_name}", **options)
 
     def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:
-        """Publish the motion of the next frame.
+        """Publish the motion of the next frame, by its contacts and (n,) calmed values.
 
-        Args:
-            contacts: of the frame.
-            value: (n,) calmed values of the n sensors.
-            acquired_ns: of the frame, CLOCK_MONOTONIC ns.
-
-        Raises:
-            Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
+        Raises as :meth:`skinware.service.ServiceWriter.begin`.
         """
         found = motion_of(self._index, contacts, value)
         columns = self._service.begin()

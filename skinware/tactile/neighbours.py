@@ -287,14 +287,10 @@ def _roots(count: int, low: Whole, high: Whole) -> Whole:
 
 
 def without_holes(touched: Flags, neighbours: npt.NDArray[Any]) -> Flags:
-    """Return (n,) bool the touched taxels and their holes: taxels most of whose neighbours are among them.
+    """Return (n,) bool the touched taxels and their holes: taxels most of whose (n, k) neighbours are among them.
 
     At the edge of a skin taxels have few neighbours. There, the number of such neighbours must be more than half of the
     usual number, or the result would grow along the edge.
-
-    Args:
-        touched: (n,) bool.
-        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows.
     """
     is_neighbour = neighbours != NONE
     count = is_neighbour.sum(axis=1)

@@ -1,12 +1,4 @@
-"""Find touches within two frames, before a baseline has confirmed them, and turn contacts into events.
-
-::
-
-    with ContactsReader(namespace="calm", timeout_s=10) as contacts:
-        for event in contacts.events():
-            if event.kind is EventKind.ONSET:
-                ...                             # a reflex: 2 frames after the touch, and sometimes for nothing
-"""
+"""Find touches within two frames, before a baseline has confirmed them, and turn contacts into events."""
 
 from __future__ import annotations
 
@@ -42,10 +34,8 @@ class Onsets:
     def update(self, above: Floats, noise: Floats, usable: Flags) -> Flags:
         """Return (n,) bool, which taxels are touched, as far as the newest frames say.
 
-        Args:
-            above: (n,) how far each value is above its baseline, not smoothed.
-            noise: (n,) standard deviation of that, noise and baseline; NaN: not known, so that nothing is found.
-            usable: (n,) bool, which values are of this frame.
+        ``above`` is how far each value is above its baseline, not smoothed, and ``noise`` the standard deviation of
+        that, noise and baseline; NaN: not known, so that nothing is found. ``usable`` values are of this frame.
         """
         is_above = usable & (above > np.maximum(_ABOVE_SIGMA * noise, self._least))
         count = np.sum([is_above, *self._were], axis=0, dtype=np.int8)
@@ -69,13 +59,7 @@ class EventKind(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class ContactEvent:
-    """An event.
-
-    Attributes:
-        kind: what has happened.
-        contact: the contact; at the end, as it was last seen.
-        acquired_ns: of the frame in which that was seen, CLOCK_MONOTONIC ns.
-    """
+    """An event: its kind, its contact (at the end, as it was last seen), and when the frame of it was acquired, ns."""
 
     kind: EventKind
     contact: Contact

@@ -109,13 +109,9 @@ class Regions:
     def of(self, skin: SkinLayout | Structure, type_name: str) -> RegionIndex:
         """Return the positions of the sensors of a type, for every region that may have such sensors.
 
-        The result is computed once for each layout or structure.
-
-        Args:
-            skin: the layout of a whole skin (``snapshot.layout``), or the structure of one driver, for which limits to
-                drivers do not count.
-            type_name: type of the sensors. Positions count in the order of ``snapshot.physical(type_name)``, or of
-                ``structure.index(type_name)``.
+        Positions count in the order of ``snapshot.physical(type_name)`` of a whole skin (``snapshot.layout``), or of
+        ``structure.index(type_name)`` of one driver, for which limits to drivers do not count. The result is computed
+        once for each layout or structure.
 
         Raises:
             StructureError: the skin has no such sensors.
@@ -274,13 +270,9 @@ def regions_to_toml(regions: Iterable[Region], comment: str = "") -> str:
 def put_region(path: str | Path, region: Region, *, replace: bool = False) -> None:
     """Write a region into a file, which is created if necessary; everything else in it stays.
 
-    Args:
-        path: path of the file.
-        region: the region.
-        replace: replace a region of this name.
-
     Raises:
-        ConfigurationError: it is no file of regions, has a region of this name, or would be wrong with this one.
+        ConfigurationError: it is no file of regions, would be wrong with this region, or has one of this name, which is
+            not to be replaced.
         OSError: it cannot be written.
     """
     path = Path(path)

@@ -1,12 +1,6 @@
 """Filter, scale and amplify the values of n taxels of one type, frame by frame: the stages of a chain.
 
-Each can be used alone::
-
-    stage = FilterSettings(method="median", frames=3).stage(taxels)
-    signal = Signal.of(time_ns, values)
-    stage.step(signal)
-    signal.values
-
+Each can be used alone: make it from its settings with ``stage(taxels)``, and change a :class:`Signal` with ``step``.
 The settings of a stage are also its entry in the file of a chain.
 """
 

@@ -78,10 +78,7 @@ def check_file(geometry: Geometry, module: npt.NDArray[np.integer]) -> list[Find
 
 
 def check_strokes(
-    geometry: Geometry,
-    module: npt.NDArray[np.integer],
-    patch: npt.NDArray[np.integer],
-    topology: Topology,
+    geometry: Geometry, module: npt.NDArray[np.integer], patch: npt.NDArray[np.integer], topology: Topology
 ) -> list[Finding]:
     """Return the errors of a geometry of n taxels by strokes, with (n,) modules and patches, and their topology."""
     check = _Check(geometry, topology)

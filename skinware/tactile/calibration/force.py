@@ -39,8 +39,7 @@ class ForceData:
     Attributes:
         time_s: (m,) rising.
         load: (m, n) calmed values, 0: untouched.
-        force_n: (m,) the reference, N.
-        temperature_c: (m,) of the skin; NaN: not known.
+        force_n, temperature_c: (m,) the reference, N, and the temperature of the skin; NaN: not known.
     """
 
     time_s: Doubles

@@ -148,11 +148,7 @@ class PressSession(Session):
     """
 
     def __init__(
-        self,
-        n: int,
-        wanted: int = 5,
-        pose_shape: tuple[int, ...] = (3,),
-        settings: PressSettings | None = None,
+        self, n: int, wanted: int = 5, pose_shape: tuple[int, ...] = (3,), settings: PressSettings | None = None
     ) -> None:
         self.kind = "points" if pose_shape == (3,) else "poses"
         self._n, self._wanted, self._pose_shape = n, wanted, pose_shape

@@ -36,11 +36,11 @@ _MM, _MINUTE_S = 1e3, 60.0
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """The errors of a tool, as far as presses show them.
+    """The errors of a tool, as far as presses show them, in words.
 
     Attributes:
-        found: errors that were found and corrected, in words.
-        doubts: errors that were found and cannot be corrected, in words; none: the places can be trusted.
+        found, doubts: errors that were found and corrected, and those that cannot be; without doubts places can be
+            trusted.
         unchecked: errors that would not show: by how much each may move the places, m; infinite: by any way.
     """
 

@@ -1,23 +1,6 @@
 """Press a simulated skin with gestures, forces over time at places that may move; read them from a stage file.
 
-::
-
-    format = "skinware-stage"
-    version = 1
-    repeat_s = 12.0                     # it begins again after this time; optional: default once
-
-    [[push]]
-    at_m = [0.07, 0.0225, 0.0]
-    force_n = 3.0
-    begin_s = 1.0
-    end_s = 4.0
-
-    [[stroke]]
-    path_m = [[0.02, 0.0225, 0.0], [0.12, 0.0225, 0.0]]
-    force_n = 4.0
-    begin_s = 5.0
-    end_s = 9.0
-    radius_m = 0.006                    # and rise_s, fall_s, name, as for Gesture
+docs/tactile/world.md has an example of the file, which is TOML.
 """
 
 from __future__ import annotations
@@ -106,11 +89,7 @@ class Gesture(ABC):
 
 @dataclass(frozen=True, kw_only=True)
 class Push(Gesture):
-    """A force at one point.
-
-    Attributes:
-        at_m: x, y, z, m.
-    """
+    """A force at one point, x, y, z, m."""
 
     at_m: tuple[float, float, float]
 
@@ -125,10 +104,7 @@ class Push(Gesture):
 
 @dataclass(frozen=True, kw_only=True)
 class Stroke(Gesture):
-    """A force that moves along a line of points, at one speed.
-
-    Attributes:
-        path_m: at least two points, x, y, z, m.
+    """A force that moves along a line of points, x, y, z, m, at one speed.
 
     Raises:
         ConfigurationError: fewer than two points.
@@ -204,11 +180,7 @@ class Wander(Stroke):
 
 @dataclass(frozen=True, kw_only=True)
 class Cover(Gesture):
-    """An even load on given taxels, wherever they are: a hand that lies on a module.
-
-    Attributes:
-        taxels: their numbers.
-    """
+    """An even load on given taxels, by their numbers, wherever they are: a hand that lies on a module."""
 
     taxels: tuple[int, ...]
 
@@ -252,12 +224,7 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Play:
-    """The gestures of a stage file.
-
-    Attributes:
-        gestures: forces in N.
-        repeat_s: everything begins again after this time; None: it happens once.
-    """
+    """The gestures of a stage file, forces in N; everything begins again after ``repeat_s``, None: it happens once."""
 
     gestures: tuple[Gesture, ...]
     repeat_s: float | None

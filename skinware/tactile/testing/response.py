@@ -84,7 +84,7 @@ class Missing:
 
 @dataclass(frozen=True)
 class Jump:
-    """A board that moves its baseline by counts; for how long the status is ``SUSPECT``, 0 if its driver notices nothing."""
+    """A board that moves its baseline by counts, and is ``SUSPECT`` for a while; 0: its driver notices nothing."""
 
     taxels: Whole
     counts: float

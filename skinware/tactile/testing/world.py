@@ -223,13 +223,7 @@ class World:
         source[one], source[other] = source[other].copy(), source[one].copy()
 
     def missing(
-        self,
-        taxels: Taxels,
-        begin_s: float,
-        end_s: float,
-        *,
-        status: Status = Status.STALE,
-        value: float | None = None,
+        self, taxels: Taxels, begin_s: float, end_s: float, *, status: Status = Status.STALE, value: float | None = None
     ) -> None:
         """Let taxels send nothing for a while. For nothing in the first frame, begin before 0.
 

@@ -50,7 +50,7 @@ class _Guess(NamedTuple):
     """A module of so many taxels, and the reason."""
 
     map: ModuleMap
-    count: int
+    taxels: int
     why: str
 
 

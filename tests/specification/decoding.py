@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.samples import Unused
-from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
+from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Form, KeyField
 from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
 from skinware_drivers.decoding.decoder import NONE_YET, PATCH_COUNTERS, Decoder, SkinState, Updates, read_numbers
@@ -61,7 +61,6 @@ def slots_of(addresses: Addresses, bus: npt.NDArray[np.uint16], identifier: npt.
 
 def _look_up(form: Form, bus: npt.NDArray[np.uint16], identifier: Indices, slots: Indices, rows: Indices) -> None:
     match = bus == form.bus
-    match &= (identifier & EXTENDED_FLAG) != 0
     for condition in form.conditions:
         match &= identifier & condition.mask == condition.value
     hits = np.flatnonzero(match)

@@ -86,8 +86,13 @@ def guess(source: ColumnSource) -> str:
 def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> list[str]:
     rows = tables[table]
     names = [name for name in rows if name != time]
+    beside = {f"{name}_status" for name in names} | {
+        f"{name.rpartition('.')[0]}.age" for name in names if "tactile" in name
+    }
     possible = [
-        name for name in names if (_TOUCH.search(name) or not _NO_TAXELS.search(name)) and not _TIMES.fullmatch(name)
+        name
+        for name in names
+        if (_TOUCH.search(name) or not _NO_TAXELS.search(name)) and not _TIMES.fullmatch(name) and name not in beside
     ]
     pattern = {name: _NUMBER.sub("#", _AXIS.sub("", name)) for name in possible}
     alike = Counter(pattern.values())

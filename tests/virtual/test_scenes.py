@@ -10,7 +10,7 @@ import numpy as np
 
 from skinware_drivers.virtual.hardware import load_emulator
 from skinware_drivers.virtual.physics.binding import SCENES, find_binding
-from skinware_drivers.virtual.physics.body import Scene
+from skinware_drivers.virtual.physics.body import PhysicsScene
 
 from .rig import MS, START_NS
 from .scenes import course_of
@@ -18,11 +18,11 @@ from .scenes import course_of
 SHIPPED = sorted(path.name.removesuffix(".toml").split(".") for path in SCENES.glob("*.toml"))
 
 
-def scene_of(name: str, driver: str) -> Scene:
-    return Scene(find_binding(f"mujoco:{name}", driver))
+def scene_of(name: str, driver: str) -> PhysicsScene:
+    return PhysicsScene(find_binding(f"mujoco:{name}", driver))
 
 
-def body_at(scene: Scene, name: str) -> list[float]:
+def body_at(scene: PhysicsScene, name: str) -> list[float]:
     place: list[float] = scene.data.body(name).xpos.tolist()
     return place
 

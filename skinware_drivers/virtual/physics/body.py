@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.physics.binding import Bound
-from skinware_drivers.virtual.physics.taxels import Taxels, add_sensors, place, place_sensors
+from skinware_drivers.virtual.physics.taxels import BoundTaxels, add_sensors, place, place_sensors
 
 ArrayF = npt.NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class Touching(NamedTuple):
     slip_m_s: float
 
 
-class Scene:
+class PhysicsScene:
     """The physics of a scene and the forces on its taxels.
 
     Attributes:
@@ -62,7 +62,7 @@ class Scene:
         try:
             spec = mujoco.MjSpec.from_file(str(bound.scene))
             bare = spec.compile()
-            self.modules: list[Taxels] = [place(bare, module, bound) for module in bound.binding.module]
+            self.modules: list[BoundTaxels] = [place(bare, module, bound) for module in bound.binding.module]
             add_sensors(spec, self.modules)
             self.model: Any = spec.compile()
         except ValueError as error:
@@ -201,14 +201,14 @@ class Scene:
                 raise ConfigurationError(f"{where}: {name}={target!r} is no number")
 
 
-def distances(taxels: Taxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:
+def distances(taxels: BoundTaxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:
     """Return (n,) distances of taxels from a contact, m; infinite for those that face another way."""
     distance: ArrayF = np.linalg.norm(taxels.position_m - point_m, axis=1)
     distance[taxels.axes[:, 2] @ normal < _SAME_WAY + _EPSILON] = np.inf
     return distance
 
 
-def spread(taxels: Taxels, depth_m: ArrayF, touches: Sequence[Touching]) -> ArrayF:
+def spread(taxels: BoundTaxels, depth_m: ArrayF, touches: Sequence[Touching]) -> ArrayF:
     """Return (n, 3) forces on taxels, N: shear along x and y, and normal force.
 
     The force of a contact is spread over the taxels that are nearest to it, in proportion to their depth. Where none

@@ -9,7 +9,7 @@ import numpy as np
 from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceWriter
-from skinware_drivers.virtual.physics.body import Scene
+from skinware_drivers.virtual.physics.body import PhysicsScene
 
 TRUTH, JOINTS = "truth", "joints"
 RATE_HZ = 100
@@ -24,7 +24,7 @@ class WorldServices:
         NameInUse: another world publishes here.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: PhysicsScene) -> None:
         self._scene = scene
         self._due_ns = 0
         n, joints, actuators = len(scene.modules), len(scene.joints), len(scene.actuators)
@@ -129,5 +129,5 @@ def _texts(names: list[str]) -> Any:
     return np.array([name.encode()[:_LONGEST_NAME] for name in names] or [b""], f"|S{_LONGEST_NAME}")
 
 
-def _addresses(scene: Scene) -> Any:
+def _addresses(scene: PhysicsScene) -> Any:
     return zip(scene.model.jnt_qposadr, scene.model.jnt_dofadr, strict=True)

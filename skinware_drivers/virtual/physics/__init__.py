@@ -10,7 +10,7 @@ from skinware_drivers.virtual.device import EmulatorOptions
 if TYPE_CHECKING:
     from skinware_drivers.virtual.physics.world import PhysicsWorld
 
-WORLD_NS = 4_000_000
+WORLD_NS = 2_000_000
 """Time between two looks at the commands of a world."""
 
 

@@ -58,8 +58,9 @@ def test_a_geometry_file_becomes_taxels_and_comes_back(tmp_path: Path) -> None:
 
 def test_some_sensors_of_a_geometry_file(tmp_path: Path) -> None:
     group = GeometryGroup("pressure", "pad", (9, 7, 8), ((0.0, 0.0, 0.0), (0.003, 0.0, 0.0), (0.006, 0.0, 0.0)))
-    (tmp_path / "places.toml").write_text(geometry_to_toml([group]))
-    scene = pad(tmp_path, 'geometry = "places.toml"\nuid = [7, 8]')
+    elsewhere = GeometryGroup("pressure", "chest", (6,), ((0.0, 0.0, 0.0),))
+    (tmp_path / "places.toml").write_text(geometry_to_toml([elsewhere, group]))
+    scene = pad(tmp_path, 'geometry = "places.toml"\nuid = [6, 8]')
     assert scene.modules[0].position_m.tolist() == [[0.003, 0, 0], [0.006, 0, 0]], "in the order of their uid"
 
 

@@ -83,7 +83,7 @@ def place(model: Any, module: ModuleBinding, bound: Bound) -> BoundTaxels:
     if module.geometry:
         geometry = read_geometry(bound.file.parent / module.geometry)
         first, last = module.uid
-        rows = np.flatnonzero((geometry.uid >= first) & (geometry.uid <= last) & np.isfinite(geometry.position_m[:, 0]))
+        rows = np.flatnonzero((geometry.frame == module.body) & (geometry.uid >= first) & (geometry.uid <= last))
         rows = rows[np.argsort(geometry.uid[rows])]
         position_m, normal = geometry.position_m[rows], np.nan_to_num(geometry.normal[rows], nan=0.0)
     elif module.arm_board is not None:
@@ -104,7 +104,7 @@ def place(model: Any, module: ModuleBinding, bound: Bound) -> BoundTaxels:
             along = np.cross(module.y, third)
         along /= np.linalg.norm(along)
         axes[row] = along, np.cross(third, along), third
-    return BoundTaxels(module, body, geoms, position_m, axes, _reach(position_m))
+    return BoundTaxels(module, body, geoms, position_m, axes, module.reach_m or _reach(position_m))
 
 
 def add_sensors(spec: Any, taxels: list[BoundTaxels]) -> None:

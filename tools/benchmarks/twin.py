@@ -71,7 +71,9 @@ class Twin:
             contacts = self._contacts.update(calm.value, calm.touched, self._time_ns)
             touches = [touch for touch in self.scene.touching() if touch.module == self._module]
             force_n = sum(touch.normal_n for touch in touches)
-            point = sum(touch.point_m * touch.normal_n for touch in touches) / force_n if force_n > 0 else None
+            point: ArrayF | None = None
+            if force_n > 0:
+                point = np.sum([touch.point_m * touch.normal_n for touch in touches], axis=0) / force_n
             slip_m_s = max((touch.slip_m_s for touch in touches), default=0.0)
             load = np.asarray(calm.value, np.float64)
             yield Frame(self._time_ns / 1e9, load, contacts, point, force_n, slip_m_s)
@@ -170,7 +172,8 @@ def slip_onset(seed: int, slips: int) -> str:
     per_minute = false * PERIOD_NS / 1e9 / held_s * 60
     text = f"{100 * share:.0f} % within 30 ms; {len(caught)} of {slips} found at all, median {median}"
     wanted = "95 % of slips, 1 s of false slip a minute"
-    return f"{text}; {per_minute:.1f} s of false slip a minute | {wanted} | {judged(share >= 0.95 and per_minute <= 1)}"
+    verdict = judged(bool(share >= 0.95 and per_minute <= 1))
+    return f"{text}; {per_minute:.1f} s of false slip a minute | {wanted} | {verdict}"
 
 
 def loosened_grip(seed: int, hold_s: float) -> str:

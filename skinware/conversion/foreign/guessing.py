@@ -93,7 +93,10 @@ def guess(source: ColumnSource) -> str:
 def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> list[str]:
     rows = tables[table]
     names = [name for name in rows if name != time]
-    possible = [name for name in names if not _is_other(name) and not _TIMES.fullmatch(name)]
+    beside = {f"{name}_status" for name in names} | {
+        f"{name.rpartition('.')[0]}.age" for name in names if "tactile" in name
+    }
+    possible = [name for name in names if not _is_other(name) and not _TIMES.fullmatch(name) and name not in beside]
     pattern = {name: _NUMBER.sub("#", _AXIS.sub("", name)) for name in possible}
     alike = Counter(pattern.values())
     wanted = [name for name in possible if _TAXELS.search(name) or alike[pattern[name]] >= _MANY] or possible

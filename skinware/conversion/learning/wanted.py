@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
-import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,12 +13,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.tables import TableSource, pyarrow
+from skinware.conversion.foreign import open_source
+from skinware.conversion.foreign.source import Rows, whole
+from skinware.conversion.tables import TableSource
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.text import nearest_name
 
 _COLUMNS = ("start_s", "end_s", "task", "file")
+_END = "end"
 RESERVED = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task")
 """Features that every learning set has."""
 
@@ -70,6 +73,14 @@ class LearningSet:
         within_s: greatest distance of a joined row; None: the time between two rows.
         at: name of a joined feature whose times are those of the rows; empty: a row each 1 / fps.
         each_structure: write a set for each structure of the drivers, in folders; False: refuse several structures.
+        by_marks: each mark in a recording begins an episode, whose task is its text; a mark ``end`` only ends one.
+        form: ``tactile``: values, status and age of each driver; or in a form that stock policies of LeRobot read:
+            ``state``: numbers in ``observation.state``, as the robot ``skinware`` has them; ``images``, as the camera
+            has them; ``points``: (n, 6) places and forces.
+        numbers: of ``state``: sum and largest value of each ``module``, or each ``taxel``.
+        size: height and width of images.
+        colours: of images.
+        value_range: of the darkest and brightest colour; None: of the sensor type.
     """
 
     fps: int = 30
@@ -82,6 +93,12 @@ class LearningSet:
     within_s: float | None = None
     at: str = ""
     each_structure: bool = False
+    by_marks: bool = False
+    form: Literal["tactile", "state", "images", "points"] = "tactile"
+    numbers: Literal["module", "taxel"] = "module"
+    size: tuple[int, int] = (64, 64)
+    colours: Literal["grey", "signed", "log"] = "grey"
+    value_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.fps < 1 or self.window < 0:
@@ -90,6 +107,8 @@ class LearningSet:
         for name in names:
             if not name or "/" in name or name in RESERVED or names.count(name) > 1:
                 raise ConfigurationError(f"{name!r} cannot be the name of a joined feature, or is there twice")
+        if self.by_marks and self.intervals:
+            raise ConfigurationError("episodes are either at marks or listed")
         if self.at and self.at not in names:
             raise ConfigurationError(f"rows at the times of {self.at!r}: that is not joined")
 
@@ -107,6 +126,32 @@ def interval_of(text: str) -> Interval:
     """
     start, _, end = text.partition("..")
     return _interval(start, end, f"episode {text!r}")
+
+
+def intervals_of_marks(source: TableSource, end_s: float) -> list[Interval]:
+    """Return the episodes at the marks of a recording: from each to the next, or to the end.
+
+    Args:
+        source: the recording.
+        end_s: time at which it ends, s since it began.
+
+    Raises:
+        ConfigurationError: there are no marks in it.
+    """
+    marks = [
+        ((event["log_time_ns"] - source.start_ns) / NS_PER_S, str(event.get("text", "")))
+        for event in source.events
+        if event.get("event") == "mark"
+    ]
+    ends = [*(time_s for time_s, _ in marks[1:]), end_s]
+    found = [
+        Interval(max(0.0, begin_s), until_s, text or None)
+        for (begin_s, text), until_s in zip(marks, ends, strict=False)
+        if text != _END and until_s > max(0.0, begin_s)
+    ]
+    if not found:
+        raise ConfigurationError(f"{source.path}: no mark in it begins an episode: press m in skin-view")
+    return found
 
 
 def read_intervals(path: Path) -> list[Interval]:
@@ -161,8 +206,6 @@ the recording began."""
 _OF_ONE_RECORDING = ("monotonic_ns", "time_s")
 _VIDEOS = (".mp4", ".mkv", ".avi", ".webm", ".mov")
 
-Columns = Mapping[str, npt.NDArray[Any]]
-
 
 class Joined:
     """Data for a feature: rows of numbers, or paths of images, each with its time.
@@ -178,23 +221,21 @@ class Joined:
 
     def __init__(self, join: Join) -> None:
         self.name, self.path = join.feature, join.path
-        columns = _read(join.path)
-        found = [name for name in TIMES if name in columns]
-        if len(found) != 1:
-            raise ConfigurationError(f"{self.path}: one column must have the time, as one of: {', '.join(TIMES)}")
-        self._time = found[0]
-        self._times = columns[self._time]
-        if self._times.dtype.kind not in "iuf" or not np.isfinite(self._times.astype(np.float64)).all():
+        with contextlib.closing(open_source(join.path)) as source:
+            timed = [(table, name) for table, names in source.tables.items() for name in TIMES if name in names]
+            if len(timed) != 1:
+                raise ConfigurationError(f"{self.path}: one column must have the time, as one of: {', '.join(TIMES)}")
+            [(table, self._time)] = timed
+            known = [*source.tables[table], *source.left_out]
+            chosen = join.columns or tuple(name for name in known if name != self._time)
+            for name in chosen:
+                if name not in known:
+                    raise ConfigurationError(f"{self.path}: no column {name!r}{nearest_name(name, known)}")
+            columns = whole(source, table, [self._time, *chosen])
+        self._times = columns.pop(self._time).ravel()
+        if not np.isfinite(self._times.astype(np.float64)).all():
             raise ConfigurationError(f"{self.path}: {self._time} is not numbers")
-        if not len(self._times):
-            raise ConfigurationError(f"{self.path}: no rows in it")
-        chosen = join.columns or tuple(name for name in columns if name not in TIMES)
-        for name in chosen:
-            if name not in columns:
-                raise ConfigurationError(f"{self.path}: no column {name!r}{nearest_name(name, columns)}")
-        self.names, self.rows = self._joined({name: columns[name] for name in chosen})
-        if len(self.rows) != len(self._times):
-            raise ConfigurationError(f"{self.path}: {len(self.rows)} rows with {len(self._times)} times")
+        self.names, self.rows = self._joined(columns)
         backward = np.flatnonzero(np.diff(self._times) < 0)
         if len(backward):
             raise ConfigurationError(f"{self.path}: time goes back after row {backward[0] + 1}")
@@ -239,7 +280,7 @@ class Joined:
         on_axis: npt.NDArray[np.int64] = wall_ns + (axis - wall)[at]
         return on_axis
 
-    def _joined(self, columns: Columns) -> tuple[list[str], npt.NDArray[Any]]:
+    def _joined(self, columns: Rows) -> tuple[list[str], npt.NDArray[Any]]:
         if len(columns) == 1:
             (only,) = columns.values()
             if only.ndim == 1 and only.dtype.kind in "UO":
@@ -255,8 +296,8 @@ class Joined:
                 raise ConfigurationError(f"{self.path}: {name} is not a finite number in row {row + 1}")
             names += [name] if column.ndim == 1 else [f"{name}[{number}]" for number in range(rows.shape[1])]
             parts.append(rows)
-        if not names or len({len(part) for part in parts}) > 1:
-            raise ConfigurationError(f"{self.path}: no columns of numbers, or columns of different lengths")
+        if not names:
+            raise ConfigurationError(f"{self.path}: no columns of numbers")
         return names, np.concatenate(parts, axis=1)
 
     def _image(self, text: str) -> str:
@@ -286,63 +327,3 @@ def matched(
         found = np.where(is_nearer, after, before)
     is_near = (found >= 0) & (np.abs(at_ns - times_ns[np.maximum(found, 0)]) <= limit_ns)
     return np.where(is_near, found, -1)
-
-
-def _read(path: Path) -> Columns:
-    readers: dict[str, Callable[[Path], Columns]] = {".csv": _csv, ".parquet": _parquet, ".npz": _npz}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise ConfigurationError(f"{path}: join a file that ends in .csv, .parquet or .npz")
-    return reader(path)
-
-
-def _csv(path: Path) -> Columns:
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.reader(stream)
-        head = next(reader, [])
-        rows = []
-        for row in reader:
-            if len(row) != len(head):
-                raise ConfigurationError(f"{path}, line {reader.line_num}: {len(row)} columns instead of {len(head)}")
-            rows.append(row)
-    return {name: _numbers([row[number] for row in rows]) for number, name in enumerate(head)}
-
-
-def _numbers(texts: list[str]) -> npt.NDArray[Any]:
-    """Return texts as int64, as float64, or else as texts."""
-    for convert in (int, float):
-        try:
-            return np.array([convert(text) for text in texts], np.int64 if convert is int else np.float64)
-        except (ValueError, OverflowError):
-            continue
-    return np.array(texts)
-
-
-def _parquet(path: Path) -> Columns:
-    arrow = pyarrow()
-    try:
-        with path.open("rb") as stream:  # given a path, pyarrow may close it later
-            table = arrow.parquet.read_table(stream)
-    except arrow.ArrowException as error:
-        raise ConfigurationError(f"{path}: not Parquet, or damaged ({str(error).splitlines()[0]})") from None
-    columns = {}
-    for name in table.column_names:
-        column = table.column(name).combine_chunks()
-        if arrow.types.is_list(column.type) or arrow.types.is_fixed_size_list(column.type):
-            rows = column.to_pylist()
-            if any(row is None or len(row) != len(rows[0] or ()) for row in rows):
-                raise ConfigurationError(f"{path}: {name} has rows of different lengths")
-            columns[name] = np.array(rows)
-        elif column.null_count:
-            raise ConfigurationError(f"{path}: {name} is missing in some rows")
-        else:
-            columns[name] = column.to_numpy(zero_copy_only=False)
-    return columns
-
-
-def _npz(path: Path) -> Columns:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
-    except (zipfile.BadZipFile, ValueError, EOFError, TypeError) as error:
-        raise ConfigurationError(f"{path}: not an NPZ file, or damaged ({error})") from None

@@ -18,6 +18,7 @@ from skinware.driver_service import DriverReader, DriverWriter
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
+from skinware.moments import SkinMoment, TimedRows, TimeWindow
 from skinware.service import Column, Schema, ServiceReader, ServiceWriter
 from skinware.skin import Skin
 from skinware.skin_layout import SkinLayout
@@ -43,9 +44,12 @@ __all__ = [
     "ServiceWriter",
     "Skin",
     "SkinLayout",
+    "SkinMoment",
     "Snapshot",
     "Status",
     "Structure",
+    "TimeWindow",
+    "TimedRows",
     "Window",
     "get_include",
     "realtime",

@@ -24,11 +24,11 @@ def as_index(positions: npt.NDArray[np.int64]) -> Index:
     return frozen(positions.astype(np.int64))
 
 
-def group(owner: npt.NDArray[np.uint32], count: int) -> list[Index]:
+def group(owner: npt.NDArray[np.uint32], count: int) -> list[npt.NDArray[np.int64]]:
     """Return positions of what belongs to each of ``count`` owners, in order."""
-    order = np.argsort(owner, kind="stable")
+    order = frozen(np.argsort(owner, kind="stable"))
     bounds = np.searchsorted(owner[order], np.arange(count + 1))
-    return [as_index(order[bounds[i] : bounds[i + 1]]) for i in range(count)]
+    return [order[bounds[i] : bounds[i + 1]] for i in range(count)]
 
 
 def column(name: str, data: npt.ArrayLike, code: str) -> npt.NDArray[Any]:

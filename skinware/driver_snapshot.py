@@ -144,7 +144,7 @@ class DriverSnapshot(Sample):
         Raises:
             StructureError: no such type here; the same for all that take a type.
         """
-        return self.values[self.structure.index(type_name)]
+        return self.values[self.structure.span(type_name)]
 
     def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Return (n,) float32: values of all sensors of a type, in its unit; float64 where raw values are int32."""
@@ -152,12 +152,12 @@ class DriverSnapshot(Sample):
 
     def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
         """Return (n,) uint8: status of all sensors of a type."""
-        return self.status[self.structure.index(type_name)]
+        return self.status[self.structure.span(type_name)]
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
         """Return (n,) int64: ``group_time_ns`` of the update group of each sensor of a type."""
         structure = self.structure
-        return self.group_time_ns[structure.sensor_group[structure.index(type_name)]]
+        return self.group_time_ns[structure.sensor_group[structure.span(type_name)]]
 
     def fresh(
         self, type_name: str, *, max_age_s: float | None = None, at_ns: int | None = None
@@ -178,7 +178,7 @@ class DriverSnapshot(Sample):
             self.time_ns(type_name),
             at_ns=now_ns() if at_ns is None else at_ns,
             max_age_ns=(
-                limits_ns[self.structure.index(type_name)] if max_age_s is None else round(max_age_s * NS_PER_S)
+                limits_ns[self.structure.span(type_name)] if max_age_s is None else round(max_age_s * NS_PER_S)
             ),
             alive=not self.stale,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
-from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, Overrun, ServiceNotFound
 from skinware.memory import futex, segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
@@ -136,13 +136,13 @@ class Drivers(Generic[ReaderT]):
             None if there is no newer one, the service has just restarted, or is not followed any more.
         """
         reader = self.keep_up(name)
-        if reader is None or reader.latest is None:
+        if reader is None or reader.newest_position is None:
             return None
-        if newer_than is not None and reader.latest == newer_than.position:
+        if newer_than is not None and reader.newest_position == newer_than.position:
             return None
         try:
-            return reader.read(timeout_s=0.0)
-        except (ServiceTimeout, Overrun):
+            return reader.latest()
+        except Overrun:
             return None
 
     def wake_words(self) -> list[tuple[futex.Word, int]]:
@@ -180,7 +180,7 @@ class Drivers(Generic[ReaderT]):
         if not self._wants(reader):
             self._refused[name] = _Refusal(inode, _NEVER_NS)
             reader.close()
-        elif self._only_living and not (reader.alive and reader.latest):
+        elif self._only_living and not (reader.alive and reader.newest_position):
             reader.close()  # another generation came in between
         else:
             self.readers[name] = reader

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Collection, Iterator
 from typing import Self
@@ -14,6 +15,7 @@ from skinware.geometry import Geometry
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring_reader import NEWER, NEWEST, Take
+from skinware.moments import SkinMoment
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Periodic, now_ns, short_turns
 from skinware.service._reader import Tap
 from skinware.skin_layout import SkinLayout
@@ -166,6 +168,47 @@ class Skin:
             if not slept:
                 futex.sleep_on(words, min(time_ns + WAIT_SLICE_NS, deadline_ns))
 
+    def latest(self) -> Snapshot | None:
+        """Return the newest snapshot of every living driver at once; None without any.
+
+        Raises:
+            NamespaceError, Closed: as ``read``.
+        """
+        try:
+            return self.read(timeout_s=0.0)
+        except ServiceTimeout:
+            return None
+
+    def at(self, time_ns: int, *, timeout_s: float = 0.0) -> SkinMoment:
+        """Return the skin at a moment of the last second or so, such as the one of a camera's image.
+
+        Each driver's ring holds as many samples as it has slots; an older moment is answered with the oldest, and
+        ``SkinMoment.off_s`` says how far it is away.
+
+        Args:
+            time_ns: the moment, CLOCK_MONOTONIC ns.
+            timeout_s: longest wait for a sample after the moment from every driver that is not silent; 0: do not wait.
+
+        Raises:
+            ServiceTimeout: no driver.
+            NamespaceError, Closed: as ``read``.
+        """
+        deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
+        snapshot = self.read(timeout_s=timeout_s)
+        while True:
+            left_ns = deadline_ns - now_ns()
+            if left_ns > 0 and _is_to_come(snapshot, time_ns):
+                with contextlib.suppress(ServiceTimeout):
+                    snapshot = self.read(newer_than=snapshot, timeout_s=left_ns / NS_PER_S)
+                continue
+            readers = list(self._drivers.readers.values())
+            try:
+                pairs = [reader.around(time_ns) for reader in readers]
+            except Overrun:
+                continue
+            before, after = (Snapshot(self._layout, tuple(samples)) for samples in zip(*pairs, strict=True))
+            return SkinMoment(time_ns, before, after)
+
     def _look_in_c(self, known: Snapshot | None, deadline_ns: int) -> tuple[bool, Snapshot | None]:
         """Return whether C waited for anything newer, and the snapshot if there is one."""
         if self._in_c is not None and now_ns() >= self._drivers.next_look_ns:
@@ -200,7 +243,7 @@ class Skin:
         known_at = None
         if known is not None and known.layout is self._layout:
             known_at = [frame.position for frame in known.samples]
-        if known_at == [reader.latest for reader in readers]:
+        if known_at == [reader.newest_position for reader in readers]:
             return None
         try:
             samples = _nearest(readers) if align else tuple(reader.newest() for reader in readers)
@@ -212,7 +255,7 @@ class Skin:
 
     def _moved_on(self) -> bool:
         """Return whether a driver closed, or began another generation; a killed one is found by ``_discover``."""
-        return any(reader.moved_on or reader.latest is None for reader in self._drivers.readers.values())
+        return any(reader.moved_on or reader.newest_position is None for reader in self._drivers.readers.values())
 
     def samples(
         self,
@@ -315,6 +358,13 @@ def _nearest(readers: list[_SkinReader]) -> tuple[DriverSnapshot, ...]:
     ]
     moment_ns = min(reached_ns or newest_ns)
     return tuple(reader.nearest(moment_ns) for reader in readers)
+
+
+def _is_to_come(snapshot: Snapshot, time_ns: int) -> bool:
+    """Return whether a driver that is not silent has yet to reach a moment."""
+    return any(
+        frame.acquired_ns <= time_ns and frame.age_ns <= age_limit_ns(frame.period_ns) for frame in snapshot.samples
+    )
 
 
 def _too_old(snapshot: Snapshot, max_age_s: float) -> list[str]:

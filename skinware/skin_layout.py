@@ -40,7 +40,7 @@ class SkinLayout:
     def _parts(self) -> dict[str, list[tuple[int, Index]]]:
         return {
             name: [
-                (driver, structure.index(name))
+                (driver, structure.span(name))
                 for driver, structure in enumerate(self.structures)
                 if any(t.name == name for t in structure.types)
             ]

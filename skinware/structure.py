@@ -209,8 +209,12 @@ class Structure:
         return {}
 
     @cached_property
-    def _index_by_type(self) -> dict[str, Index]:
-        return {t.name: as_index(np.flatnonzero(self.sensor_type == t.id)) for t in self.types}
+    def _index_by_type(self) -> dict[str, npt.NDArray[np.int64]]:
+        return {t.name: frozen(np.flatnonzero(self.sensor_type == t.id)) for t in self.types}
+
+    @cached_property
+    def _span_by_type(self) -> dict[str, Index]:
+        return {name: as_index(positions) for name, positions in self._index_by_type.items()}
 
     @cached_property
     def _module_by_type(self) -> dict[str, npt.NDArray[np.int64]]:
@@ -218,7 +222,7 @@ class Structure:
         return {name: frozen(modules[index]) for name, index in self._index_by_type.items()}
 
     @cached_property
-    def _index_by_module(self) -> list[Index]:
+    def _index_by_module(self) -> list[npt.NDArray[np.int64]]:
         return group(self.sensor_module, self.n_modules)
 
     @cached_property
@@ -227,7 +231,7 @@ class Structure:
         return frozen(self.module_patch[self.sensor_module])
 
     @cached_property
-    def _index_by_patch(self) -> list[Index]:
+    def _index_by_patch(self) -> list[npt.NDArray[np.int64]]:
         return group(self.sensor_patch, self.n_patches)
 
     @cached_property
@@ -300,20 +304,28 @@ class Structure:
                 return candidate
         raise StructureError(f"no sensor type {name!r} in this skin{nearest_name(name, [t.name for t in self.types])}")
 
-    def index(self, type_name: str) -> Index:
-        """Return positions in a frame of all sensors of a type, in frame order.
+    def index(self, type_name: str) -> npt.NDArray[np.int64]:
+        """Return (n,) int64, read-only: positions in a snapshot of all sensors of a type, ascending.
 
         Raises:
             StructureError: no such type here.
         """
         return self._index_by_type[self.type(type_name).name]
 
-    def module_index(self, module: int) -> Index:
-        """Return positions in a frame of the sensors of a module, in frame order."""
+    def span(self, type_name: str) -> Index:
+        """Return the positions of ``index`` as a slice where they lie together, so that arrays are not copied.
+
+        Raises:
+            StructureError: no such type here.
+        """
+        return self._span_by_type[self.type(type_name).name]
+
+    def module_index(self, module: int) -> npt.NDArray[np.int64]:
+        """Return (n,) int64, read-only: positions in a snapshot of the sensors of a module, ascending."""
         return self._index_by_module[module]
 
-    def patch_index(self, patch: int) -> Index:
-        """Return positions in a frame of the sensors of a patch, in frame order."""
+    def patch_index(self, patch: int) -> npt.NDArray[np.int64]:
+        """Return (n,) int64, read-only: positions in a snapshot of the sensors of a patch, ascending."""
         return self._index_by_patch[patch]
 
     def position(self, type_name: str, uid: int) -> int:
@@ -366,7 +378,7 @@ class Structure:
             int32, which have more digits than float32 holds.
         """
         sensor_type = self.type(type_name)
-        raw = values[..., self.index(type_name)]
+        raw = values[..., self.span(type_name)]
         if self.dtype == np.int32:
             exact: npt.NDArray[np.float64] = raw.astype(np.float64)
             return exact * sensor_type.scale + sensor_type.offset

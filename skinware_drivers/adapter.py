@@ -252,8 +252,8 @@ def check_layout(layout: Layout, patches: Sequence[Patch], tables: SkinTables, p
             if needed > n_channels[module]:
                 raise ConfigurationError(
                     f"frame {frame.name!r} has a value for channel {needed - 1}, and a module of {names[module]!r} has"
-                    f" {n_channels[module]} channels, from 0: give it more, or say with `to` which values are dropped"
-                    " (None)"
+                    f" {n_channels[module]} channels, from 0: give it more, say with `to` which values are dropped"
+                    " (None), or give that module a key that the identifier of this frame cannot have"
                 )
 
 

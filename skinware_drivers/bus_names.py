@@ -16,7 +16,7 @@ _PLACING: dict[str, dict[str, str]] = {
     "socketcand": {"host": "", "port": ""},
 }
 """By interface: the options that determine the bus beside the channel, with their defaults."""
-NETWORKS = ("dds", "tcp", "udp", "websocket", "yarp")
+NETWORKS = ("dds", "ros2", "tcp", "udp", "websocket", "yarp")
 """Interfaces of serial devices that are reached over a network."""
 
 
@@ -33,9 +33,9 @@ class BusName(NamedTuple):
 
     ``vcan0`` is ``socketcan:vcan0``; ``virtual`` is an emulated skin in this process. A path, which has a slash in it
     (``/dev/ttyUSB0``, ``./port``), is a serial port; ``tcp://HOST:PORT`` and ``udp://HOST:PORT`` are streams over a
-    network; ``yarp://HOST:PORT/NAME`` is a port of a robot that runs YARP; ``dds://DOMAIN`` are topics of DDS. URLs
-    of pyserial (``rfc2217://host:port``) are serial ports, too. ``can+virtual:`` and ``can+serial:`` are the interfaces
-    of python-can whose names are taken.
+    network; ``yarp://HOST:PORT/NAME`` is a port of a robot that runs YARP; ``dds://DOMAIN`` are topics of DDS, and
+    ``ros2://DOMAIN`` those of rmw_zenoh. URLs of pyserial (``rfc2217://host:port``) are serial ports, too.
+    ``can+virtual:`` and ``can+serial:`` are the interfaces of python-can whose names are taken.
     """
 
     interface: str

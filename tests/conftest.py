@@ -8,7 +8,7 @@ import signal
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import HealthCheck, settings
+from hypothesis import HealthCheck, Phase, settings
 
 from skinware.memory.namespace import Namespace
 from skinware_drivers.testing.leaks import files_left
@@ -16,6 +16,9 @@ from skinware_drivers.testing.leaks import files_left
 # other things run beside the tests: how long an example takes says nothing
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("busy")
+settings.register_profile(
+    "unshrunk", settings.get_profile("busy"), phases=[Phase.explicit, Phase.generate], database=None
+)  # that a test fails is all that tools/mutate asks
 os.environ.setdefault("SKINWARE_TEST_PATIENCE", "5")  # read when the first test module asks for it
 os.environ.setdefault("PYTHONFAULTHANDLER", "1")  # a command that dies of a signal says where it was
 

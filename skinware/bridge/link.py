@@ -130,6 +130,15 @@ class Link:
         hear = directly(lambda sample: heard(str(sample.key_expr), sample.payload.to_bytes()))
         return self._end_of(self._session.declare_subscriber(key, hear))
 
+    def listen_attached(self, key: str, heard: Callable[[str, bytes, bytes], object]) -> Callable[[], None]:
+        """Call ``heard(key, attachment, bytes)`` as ``listen`` does."""
+
+        def hear(sample: zenoh.Sample) -> None:
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            heard(str(sample.key_expr), attachment, sample.payload.to_bytes())
+
+        return self._end_of(self._session.declare_subscriber(key, directly(hear)))
+
     def answer(self, key: str, asked: Callable[[Question], None]) -> Callable[[], None]:
         """Call ``asked`` with questions under keys, in the receiving thread; return a function that ends it."""
 

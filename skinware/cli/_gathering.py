@@ -96,7 +96,7 @@ def finding_text(finding: Finding, structure: Structure, type_name: str) -> str:
 
 def _sensors(finding: Finding, structure: Structure, type_name: str) -> npt.NDArray[np.int64]:
     """Return (k,) positions in a snapshot of the sensors of a finding."""
-    sensors: npt.NDArray[np.int64] = np.arange(structure.n_sensors)[structure.index(type_name)][finding.taxels]
+    sensors: npt.NDArray[np.int64] = structure.index(type_name)[finding.taxels]
     return sensors
 
 

@@ -132,7 +132,7 @@ class Picture:
         """Return (n_sensors,) bool for each region: the sensors of a type in it."""
         if self.regions is None:
             return {}
-        sensors = np.arange(structure.n_sensors)[structure.index(type_name)]
+        sensors = structure.index(type_name)
         found = self.regions.of(self._layouts[driver], type_name)
         inside = {region.name: np.zeros(structure.n_sensors, bool) for region in self.regions}
         for name, index in found.items():

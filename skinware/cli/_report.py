@@ -106,12 +106,10 @@ def _describe(namespace: Namespace, name: str) -> dict[str, Any]:
 
 
 def _newest(service: ServiceReader[SampleT]) -> SampleT | None:
-    if service.latest is None:
-        return None
     try:
-        return service.read(timeout_s=0.0)
-    except (ServiceTimeout, Overrun):
-        return None  # its writer restarts, or is too fast for a copy
+        return service.latest()
+    except Overrun:
+        return None  # its writer is too fast for a copy
 
 
 def _common(service: ServiceReader[Any], frame: Sample | None) -> dict[str, Any]:

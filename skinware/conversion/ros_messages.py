@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from mcap.records import Schema
 
+from skinware import ros_types
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
@@ -74,42 +75,6 @@ class Cdr:
         self._size += len(data)
 
 
-_TIME = "int32 sec\nuint32 nanosec\n"
-_HEADER = "builtin_interfaces/Time stamp\nstring frame_id\n"
-_POINT_FIELD = """\
-uint8 INT8=1
-uint8 UINT8=2
-uint8 INT16=3
-uint8 UINT16=4
-uint8 INT32=5
-uint8 UINT32=6
-uint8 FLOAT32=7
-uint8 FLOAT64=8
-string name
-uint32 offset
-uint8 datatype
-uint32 count
-"""
-_POINT_CLOUD = """\
-std_msgs/Header header
-uint32 height
-uint32 width
-sensor_msgs/PointField[] fields
-bool is_bigendian
-uint32 point_step
-uint32 row_step
-uint8[] data
-bool is_dense
-"""
-_IMAGE = """\
-std_msgs/Header header
-uint32 height
-uint32 width
-string encoding
-uint8 is_bigendian
-uint32 step
-uint8[] data
-"""
 _SKIN_FRAME = """\
 # One frame of a driver; sensors in the order of its last skinware_msgs/Sensors, whose generation is the same.
 std_msgs/Header header
@@ -138,16 +103,7 @@ float64[] x
 float64[] y
 float64[] z
 """
-TEXTS = {
-    "builtin_interfaces/Time": _TIME,
-    "std_msgs/Header": _HEADER,
-    "std_msgs/String": "string data\n",
-    "sensor_msgs/PointField": _POINT_FIELD,
-    "sensor_msgs/PointCloud2": _POINT_CLOUD,
-    "sensor_msgs/Image": _IMAGE,
-    "skinware_msgs/SkinFrame": _SKIN_FRAME,
-    "skinware_msgs/Sensors": _SENSORS,
-}
+TEXTS = {**ros_types.TEXTS, "skinware_msgs/SkinFrame": _SKIN_FRAME, "skinware_msgs/Sensors": _SENSORS}
 """Definitions of messages, by type, as ``.msg`` files have them."""
 _HEADER_PARTS = ("std_msgs/Header", "builtin_interfaces/Time")
 _STATE = {

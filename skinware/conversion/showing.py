@@ -160,7 +160,7 @@ def _clouds(name: str, structure: Structure) -> Iterator[_Cloud]:
     if geometry is None:
         return
     for sensor_type in structure.types:
-        positions = np.arange(structure.n_sensors)[structure.index(sensor_type.name)]
+        positions = structure.index(sensor_type.name)
         frames = geometry.frame[positions]
         known = geometry.known[positions]
         found = sorted(set(frames[known].tolist()))

@@ -73,10 +73,10 @@ static inline void skinware__add_statistic(const skinware_ring_writer *writer, u
 
 /* The bucket of a histogram that a time falls into: k for 2**(k-1) to 2**k - 1 ns, the last one for all above. */
 static inline unsigned skinware__bucket(int64_t value_ns) {
-    unsigned bits = 0;
-    if (value_ns > 0)
-        bits = 64 - (unsigned)__builtin_clzll((unsigned long long)value_ns);
-    return bits < SKINWARE__BUCKETS ? bits : SKINWARE__BUCKETS - 1;
+    unsigned bucket = 0;
+    for (; value_ns > 0 && bucket < SKINWARE__BUCKETS - 1; value_ns >>= 1)
+        bucket++;
+    return bucket;
 }
 
 static inline void skinware__note_spread(const skinware_ring_writer *writer, uint64_t index, int64_t value_ns,

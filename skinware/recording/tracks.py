@@ -97,7 +97,7 @@ class Series:
         Raises:
             StructureError: no such type; also raised by the other methods that take a type.
         """
-        return self.column("values")[:, self.structure.index(type_name)]
+        return self.column("values")[:, self.structure.span(type_name)]
 
     def physical(self, type_name: str) -> npt.NDArray[np.floating[Any]]:
         """Return (n, sensors) float32 values in the type's unit; float64 for raw values of int32."""
@@ -105,13 +105,13 @@ class Series:
 
     def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
         """Return (n, sensors) uint8, bits of :class:`skinware.Status`."""
-        return self.column("status")[:, self.structure.index(type_name)]
+        return self.column("status")[:, self.structure.span(type_name)]
 
     def time_ns(self, type_name: str) -> npt.NDArray[np.int64]:
         """Return (n, sensors) int64, the time of each sensor's data (of its update group); 0: never seen."""
         structure = self.structure
         times_ns = self.column("group_time_ns" if "group_time_ns" in self.origin.columns else "module_time_ns")
-        return times_ns[:, structure.sensor_group[structure.index(type_name)]]
+        return times_ns[:, structure.sensor_group[structure.span(type_name)]]
 
     def fresh(self, type_name: str, *, max_age_s: float | None = None) -> npt.NDArray[np.bool_]:
         """Return (n, sensors) bool: whether each value was fresh when its sample was published.
@@ -120,7 +120,7 @@ class Series:
             type_name: a sensor type.
             max_age_s: oldest fresh age; default: as for :meth:`skinware.DriverSnapshot.fresh`.
         """
-        limits_ns = self.structure.age_limits_ns(self.origin.period_ns)[self.structure.index(type_name)]
+        limits_ns = self.structure.age_limits_ns(self.origin.period_ns)[self.structure.span(type_name)]
         max_age_ns = limits_ns if max_age_s is None else round(max_age_s * NS_PER_S)
         at_ns = self.published_ns[:, np.newaxis]
         return is_fresh(self.status_of(type_name), self.time_ns(type_name), at_ns=at_ns, max_age_ns=max_age_ns)
@@ -291,7 +291,7 @@ class Track:
             if sensors is not None:
                 raise StructureError("sensors are counted by type: give type_name")
             return _Request(origin, names, None)
-        positions = np.arange(self.structure.n_sensors)[self.structure.index(type_name)]
+        positions = self.structure.index(type_name)
         index = as_index(positions if sensors is None else positions[sensors])
         return _Request(origin.only(index), names, index)
 

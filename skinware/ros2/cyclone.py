@@ -18,6 +18,7 @@ from cyclonedds.qos import Qos
 from cyclonedds.util import duration
 
 from skinware.errors import BridgeError, ConfigurationError
+from skinware.ros_types import TEXT, Definitions, dds_name
 
 write_bytes: Callable[[int, bytes | bytearray], int] | None
 """Publish a message, encapsulation and all, of whole words, by the reference of a writer; negative: not published."""
@@ -29,26 +30,8 @@ except (ImportError, AttributeError):  # it is not public
     write_bytes = None
 
 _NEW = SampleState.NotRead | ViewState.Any | InstanceState.Any
-_FIELD = re.compile(
-    r"^(?P<type>[\w/]+)(<=(?P<bound>\d+))?(\[(?P<most><=)?(?P<length>\d*)\])? (?P<name>\w+)$", re.MULTILINE
-)
 _ADDRESS = re.compile(r"^\d+(\.\d+){3}$|:")
-_PLAIN = {
-    "bool": bool,
-    "byte": idl.uint8,
-    "char": idl.uint8,
-    "float32": idl.float32,
-    "float64": idl.float64,
-    "int8": idl.int8,
-    "int16": idl.int16,
-    "int32": idl.int32,
-    "int64": idl.int64,
-    "string": str,
-    "uint8": idl.uint8,
-    "uint16": idl.uint16,
-    "uint32": idl.uint32,
-    "uint64": idl.uint64,
-}
+_PLAIN = {"bool": bool, TEXT: str}
 
 _LOOPBACK = (
     "<CycloneDDS><Domain id='any'><General><Interfaces><NetworkInterface address='127.0.0.1'/></Interfaces>"
@@ -87,32 +70,34 @@ def join(number: int, interfaces: Sequence[str], qos: Qos | None = None) -> tupl
         ) from None
 
 
-def struct_type(name: str, texts: Mapping[str, str], before: Mapping[str, Any] | None = None) -> type[IdlStruct]:
+def struct_type(
+    definitions: Definitions, type_name: str = "", before: Mapping[str, Any] | None = None
+) -> type[IdlStruct]:
     """Return a type for Cyclone DDS, which checks incoming messages by it.
 
     Args:
-        name: in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``; a name
-            with one slash is of no type of ROS, and the same in DDS.
-        texts: definitions as in a ``.msg`` file, by type; names of messages are without ``msg``.
+        definitions: of a message, as ROS names it; one with one slash in its name is of no type of ROS.
+        type_name: one of the types in it; empty: its own.
         before: fields that come first.
     """
+    full = type_name or definitions.type_name
+    is_of_ros = definitions.type_name.count("/") > 1
     fields: dict[str, Any] = dict(before or {})
-    *package, plain = name.split("/")
-    is_of_ros = len(package) > 1
-    for field in _FIELD.finditer(texts[name.replace("/msg/", "/")]):
-        inner = field["type"].replace("/", "/msg/" if is_of_ros else "/")
-        kind: Any = _PLAIN.get(field["type"]) or struct_type(inner, texts)
-        if field["bound"]:
-            kind = idl.bounded_str[int(field["bound"])]
-        if field["most"]:
-            kind = idl.sequence[kind, int(field["length"])]
-        elif field["length"]:
-            kind = idl.array[kind, int(field["length"])]
-        elif field["length"] is not None:
+    for field in definitions[full]:
+        if "/" in field.kind:
+            kind = struct_type(definitions, field.kind.replace("/", "/msg/") if is_of_ros else field.kind)
+        elif field.longest:
+            kind = idl.bounded_str[field.longest]
+        else:
+            kind = _PLAIN.get(field.kind) or getattr(idl, field.kind)
+        if field.most:
+            kind = idl.sequence[kind, field.most]
+        elif field.length:
+            kind = idl.array[kind, field.length]
+        elif field.length is not None:
             kind = idl.sequence[kind]
-        fields[field["name"]] = kind
-    full = f"{'.'.join(package)}.dds_.{plain}_" if is_of_ros else f"{package[0]}.{plain}"
-    made: type[IdlStruct] = make_idl_struct(plain, full, fields)
+        fields[field.name] = kind
+    made: type[IdlStruct] = make_idl_struct(full.rpartition("/")[2], dds_name(full).replace("::", "."), fields)
     return made
 
 

@@ -39,9 +39,10 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from skinware.ros2.cyclone import join, reason, struct_type, write_bytes
+from skinware.ros2 import cyclone
+from skinware.ros2.cyclone import join, reason, struct_type
+from skinware.ros_types import Definitions
 
-_write_bytes = write_bytes
 _SERVICE_QOS = Qos(depth=10)
 _REQUESTS_AT_ONCE = 16
 _ENCAPSULATION = 4
@@ -177,8 +178,8 @@ class _DdsWriter:
         writer = self._writer
         if writer is None:
             return False
-        if _write_bytes is not None:
-            return _write_bytes(self._ref, self._padded(message)) >= 0
+        if cyclone.write_bytes is not None:
+            return cyclone.write_bytes(self._ref, self._padded(message)) >= 0
         try:
             writer.write(writer.data_type.deserialize(message))
         except DDSException:
@@ -266,4 +267,4 @@ class _RequestThread:
 
 @cache
 def _type(message_type: MessageType, with_id: bool = False) -> type[IdlStruct]:
-    return struct_type(message_type.name, messages.TEXTS, _REQUEST_ID if with_id else {})
+    return struct_type(Definitions(message_type.name, messages.TEXTS), before=_REQUEST_ID if with_id else {})

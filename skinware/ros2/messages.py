@@ -37,7 +37,6 @@ TEXTS = {
     "diagnostic_msgs/KeyValue": _KEY_VALUE,
     "diagnostic_msgs/DiagnosticStatus": _DIAGNOSTIC_STATUS,
     "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
     "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
     "geometry_msgs/TransformStamped": (

@@ -25,7 +25,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from skinware.bridge.endpoints import endpoints
+from skinware.bridge.endpoints import Endpoints, endpoints
 from skinware.bridge.link import directly, open_session
 from skinware.errors import BridgeError, MissingExtra
 from skinware.ros2.transport import Cdr, Distro, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
@@ -53,6 +53,11 @@ _NODE = 0
 """Number of the only node in a session."""
 
 
+def graph_endpoints(connect: Sequence[str]) -> Endpoints:
+    """Return the settings of a peer in a graph, with endpoints of routers; ConfigurationError: one is malformed."""
+    return replace(endpoints(connect=connect), listen=(_LISTEN,), security=_SETTINGS)
+
+
 class ZenohNode:
     """A :class:`skinware.ros2.transport.Node`.
 
@@ -78,10 +83,10 @@ class ZenohNode:
         connect: Sequence[str] = (ROUTER,),
         router_changed: Callable[[bool, str], None] = lambda _is_there, _line: None,
     ) -> None:
-        places = endpoints(connect=connect)
+        places = graph_endpoints(connect)
         self._identity, self._router_changed = identity, router_changed
         self._at = ", ".join(places.connect)
-        self._session = open_session(replace(places, listen=(_LISTEN,), security=_SETTINGS))
+        self._session = open_session(places)
         self._zid = str(self._session.info.zid())
         self._numbers = itertools.count(_NODE + 1)
         self._endpoints: set[_ZenohPublisher | _ZenohService] = set()
@@ -368,7 +373,7 @@ def endpoint_token(
 ) -> str:
     """Return the token of a publisher or a service, which has a number of its own in the session."""
     place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind.value, *_of_node(identity))
-    return "/".join((*place, _mangled(name), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
+    return "/".join((*place, name.replace("/", "%"), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
 
 
 def qos_text(qos: Qos) -> str:
@@ -385,11 +390,7 @@ def gid(token: str) -> bytes:
 
 
 def _of_node(identity: NodeIdentity) -> tuple[str, str, str]:
-    return "%", _mangled(identity.namespace), identity.name
-
-
-def _mangled(name: str) -> str:
-    return name.replace("/", "%")
+    return "%", identity.namespace.replace("/", "%"), identity.name
 
 
 def _hash(identity: NodeIdentity, of_type: MessageType) -> str:

@@ -12,6 +12,7 @@ from enum import Enum
 from typing import Protocol
 
 from skinware.errors import ConfigurationError
+from skinware.ros_types import dds_name
 
 HIGHEST_DOMAIN = 232
 """A higher one would need DDS ports beyond 65535."""
@@ -80,8 +81,7 @@ class MessageType:
     @property
     def dds_name(self) -> str:
         """Its name in DDS: ``sensor_msgs::msg::dds_::PointCloud2_``."""
-        package, kind, plain = self.name.split("/")
-        return f"{package}::{kind}::dds_::{plain}_"
+        return dds_name(self.name)
 
 
 @dataclass(frozen=True)

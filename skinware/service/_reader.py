@@ -65,7 +65,7 @@ class ServiceReader(Taking[SampleT]):
         return self._accounts.record
 
     @property
-    def latest(self) -> Position | None:
+    def newest_position(self) -> Position | None:
         """Position of the newest sample of the generation at hand, None before the first."""
         sequence = self._ring.latest
         return (self._ring.generation, sequence) if sequence else None
@@ -81,7 +81,7 @@ class ServiceReader(Taking[SampleT]):
         self._require_open()
         if not self._moved:
             self._follow()
-        return self.latest
+        return self.newest_position
 
     def read(
         self,
@@ -111,6 +111,17 @@ class ServiceReader(Taking[SampleT]):
         if known is not None:
             return self._take_turn(NEWER, timeout_ns, max_age_s, known)
         return self._read(None, max_age_s, now_ns() + timeout_ns)
+
+    def latest(self) -> SampleT | None:
+        """Return the newest sample at once, as a private copy; None if nothing was published yet.
+
+        Raises:
+            Overrun, Closed: as ``read``.
+        """
+        try:
+            return self._read(None, None, now_ns())
+        except ServiceTimeout:
+            return None
 
     @contextlib.contextmanager
     def view(self) -> Iterator[SampleT]:
@@ -309,6 +320,20 @@ class Tap(ServiceReader[SampleT]):
     def nearest(self, time_ns: int) -> SampleT:
         """Return a copy of the sample in the ring whose ``acquired_ns`` is nearest to a time."""
         sequence, _ = min(self._acquisitions(), key=lambda frame: abs(frame[1] - time_ns))
+        return self._taken_from_the_past(sequence)
+
+    def around(self, time_ns: int) -> tuple[SampleT, SampleT]:
+        """Return copies of the last sample in the ring acquired by a time, and of the next one.
+
+        Where there is none on one side of that time, both are the nearest.
+        """
+        times = self._acquisitions()
+        later = next((number for number, (_, acquired_ns) in enumerate(times) if acquired_ns > time_ns), len(times))
+        before, after = max(0, later - 1), min(later, len(times) - 1)
+        first = self._taken_from_the_past(times[before][0])
+        return first, first if before == after else self._taken_from_the_past(times[after][0])
+
+    def _taken_from_the_past(self, sequence: int) -> SampleT:
         frame = self._ring.copy(sequence)
         if frame is None:
             raise Overrun(f"service {self.name!r}: sample {sequence} was overwritten before it was copied")

@@ -288,6 +288,8 @@ class Taking(Attachment[SampleT]):
 
     def _count(self, frame: SampleT) -> None:
         self._come_back()
+        if self._open_turn is not None:  # of a loop, in whose turn something else is read
+            self._end_turn()
         last, self._last_taken = self._last_taken, (frame.generation, frame.sequence)
         missed = 0 if last is None else max(0, frame.sequence - last[1] - 1)  # of this generation: _adopt saw to it
         self._accounts.taken(missed)

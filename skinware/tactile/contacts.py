@@ -17,6 +17,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from skinware._columns import Index
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.structure import Structure
@@ -136,6 +137,17 @@ class ContactSet:
 
     def __iter__(self) -> Iterator[Contact]:
         return (self[row] for row in range(len(self)))
+
+    def on(self, taxels: Index, *, above: float = 0.0) -> Contact | None:
+        """Return the contact with the largest load of those that have some of these taxels; None without any.
+
+        Args:
+            taxels: positions among the n taxels, of any shape: a region's, or a matrix.
+            above: the load is larger than this, in the unit of the values; provisional contacts have no load.
+        """
+        rows = np.unique(self.contact_of[taxels])
+        rows = rows[(rows >= 0) & (self.load[rows] > above)]
+        return self[int(rows[np.argmax(self.load[rows])])] if len(rows) else None
 
 
 _SCALARS = ("age_s", "load", "peak", "area_m2", "force_n", "load_whole", "uncertainty")

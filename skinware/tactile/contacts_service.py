@@ -21,6 +21,9 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 import numpy.typing as npt
 
+from skinware._columns import Index
+from skinware.memory.ring import ACQUIRED
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.onsets import ContactEvent, Events
@@ -114,6 +117,35 @@ class ContactsReader(SourceReader[ContactsSample]):
         events = Events()
         for sample in self.in_order(timeout_s=timeout_s):
             yield from events.of(sample.contacts, sample.acquired_ns)
+
+    def on(self, taxels: Index, *, above: float = 0.0, within_s: float = 0.0) -> Contact | None:
+        """Return the newest contact on some taxels at once; None without any.
+
+        ::
+
+            tip = structure.matrices("pressure")["right hand, index top"]
+            if contacts.on(tip, above=20, within_s=0.1):
+                stop()
+
+        Args:
+            taxels: positions among the sensors of the contacts' type: of a region, or a matrix.
+            above: its load is larger than this, in the unit of the values.
+            within_s: look at all samples in the ring whose data is at most this old, so that a loop does not miss a
+                short touch; 0: only at the newest one, whatever its age.
+
+        Raises:
+            Closed: this reader was closed.
+        """
+        newest = self.latest()
+        if newest is None:
+            return None
+        samples, since_ns = [newest], now_ns() - round(within_s * NS_PER_S)
+        for sequence, acquired_ns in reversed(self._ring.times_ns(ACQUIRED) if within_s else []):
+            if acquired_ns >= since_ns and sequence < newest.sequence:
+                samples += filter(None, [self._ring.copy(sequence)])
+        if within_s and newest.acquired_ns < since_ns:
+            return None
+        return next(filter(None, (sample.contacts.on(taxels, above=above) for sample in samples)), None)
 
 
 class More(TypedDict, total=False):

@@ -51,7 +51,7 @@ class _Source:
     @property
     def has_more(self) -> bool:
         """Whether the newest frame of this generation is another than the last one that was taken."""
-        latest = self.reader.latest
+        latest = self.reader.newest_position
         return latest is not None and latest != self.reader.last_taken
 
 

@@ -174,7 +174,7 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
         return []
     source = frame.source
     try:
-        sensors = np.arange(structure.n_sensors)[structure.index(source.type_name)]
+        sensors = structure.index(source.type_name)
     except StructureError:
         return []
     if not np.array_equal(structure.sensor_uid[sensors], source.uid):

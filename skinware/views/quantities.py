@@ -156,7 +156,7 @@ def _with_uids(structure: Structure, uids: list[int], types: tuple[str, ...]) ->
     """Return (n, len(types)) positions of the sensors of each type with these n uids, -1 without one."""
     columns = []
     for name in types:
-        positions = np.arange(structure.n_sensors)[structure.index(name)].tolist()
+        positions = structure.index(name).tolist()
         known = dict(zip(structure.sensor_uid[positions].tolist(), positions, strict=True))
         columns.append([known.get(uid, -1) for uid in uids])
     return np.array(columns, np.int64).reshape(len(types), len(uids)).T

@@ -76,7 +76,7 @@ def vectors_of(
     full = kind.maximum if full_scale is None else full_scale
     if not 0 < full < np.inf:
         raise ConfigurationError(f"driver {name}: what is 255? Its {type_name} has no maximum: give --full-scale")
-    of_type = np.arange(structure.n_sensors)[structure.index(type_name)]
+    of_type = structure.index(type_name)
     vectors = {}
     for part, sensors in _parts(name, structure, driver_type, of_type, type_name, regions).items():
         places, length = _places(structure, driver_type, sensors)

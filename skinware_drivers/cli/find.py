@@ -112,7 +112,7 @@ async def look(
     topics = {
         name: await asyncio.to_thread(topics_on, name, listen_s, known_drivers("serial", driver_names))
         for name in networks
-        if BusName.of(name).interface == "dds"
+        if BusName.of(name).interface in ("dds", "ros2")
     }
     detection: Detection
     detection, *listened = await asyncio.gather(search(), *(listen(name, listen_s, drivers) for name in buses_to_hear))

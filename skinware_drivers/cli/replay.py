@@ -18,7 +18,7 @@ from skinware.cli.replay import NAMESPACE, Playback, publish_again
 if TYPE_CHECKING:
     from skinware.recording import Recording
     from skinware_drivers.bus import Bus
-    from skinware_drivers.virtual.recorded import WireSource
+    from skinware_drivers.virtual.logs import WireSource
     from skinware_drivers.virtual.recorded_wire import RecordedWire
 
 _LONGEST_SLEEP_S = 0.05

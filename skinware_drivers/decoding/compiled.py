@@ -137,7 +137,7 @@ def update_groups(tables: SkinTables, carriers: Sequence[UpdateMaker]) -> tuple[
 def _divide(tables: SkinTables, module: int, carriers: Sequence[UpdateMaker]) -> list[tuple[tuple[int, ...], Indices]]:
     """Return the groups of a module: the carriers that update each, and its sensors."""
     mine = [number for number, carrier in enumerate(carriers) if module in carrier.modules]
-    sensors = np.arange(tables.structure.n_sensors)[tables.structure.module_index(module)]
+    sensors = tables.structure.module_index(module)
     if len(mine) < 2:
         return [(tuple(mine), sensors)]
     channel_of = {sensor: channel for channel, sensor in enumerate(tables.channel_to_sensor[module].tolist())}

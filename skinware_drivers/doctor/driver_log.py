@@ -254,7 +254,7 @@ def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, 
     found: list[str] = []
     for module, name in enumerate(structure.module_names):
         kind = structure.module_kind[module].decode()
-        index = np.arange(structure.n_sensors)[structure.module_index(module)]
+        index = structure.module_index(module)
         for type_id in np.unique(structure.sensor_type[index]).tolist():
             of_type = bad[index[structure.sensor_type[index] == type_id]]
             shape = filled_by(kind, len(of_type))
@@ -304,7 +304,7 @@ class TaxelJudge:
             reports = self._health.reports()
         known_noise = untouched = judged = 0
         for name, report in reports.items():
-            positions = np.arange(self._structure.n_sensors)[self._structure.index(name)]
+            positions = self._structure.index(name)
             faults += taxel_faults(self._structure, positions, report)
             judged += len(positions)
             known_noise += int(np.isfinite(report.noise).sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -16,7 +17,7 @@ from skinware_drivers.finding.guess import Guess, IdentifierClass, Traffic, gues
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.registry import make_bus
 from skinware_drivers.running.news import reason_text, share_of_time
-from skinware_drivers.streams.dds import HeardTopic
+from skinware_drivers.streams.dds import HeardTopic, TopicBus
 
 _CAN_PAYLOAD = 64
 _IDENTIFY_S = 5.0
@@ -167,9 +168,16 @@ def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAd
     Raises:
         BusNotAvailable: the domain cannot be joined.
     """
-    from skinware_drivers.streams.dds_ends import heard_topics
-
-    name = BusName.of(bus_name)
+    bus = make_bus(bus_name)
+    if not isinstance(bus, TopicBus):
+        return []
+    bus.topics = ()
+    bus.open()
+    try:
+        time.sleep(duration_s)
+        found = bus.heard()
+    finally:
+        bus.close()
     return [
         replace(
             heard,
@@ -183,7 +191,7 @@ def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAd
                 )
             ),
         )
-        for heard in heard_topics(name.channel, name.options, duration_s)
+        for heard in found
     ]
 
 

@@ -31,7 +31,8 @@ from skinware_drivers.proving.updates import Collected, Comparison, Decoding, co
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, package_on
-from skinware_drivers.virtual.recorded import WireSource, medium_of, replayed_bus, wire_of
+from skinware_drivers.virtual.logs import WireSource
+from skinware_drivers.virtual.recorded import medium_of, replayed_bus, wire_of
 
 _NAME = "captured"
 _SLOTS = 64

@@ -24,7 +24,7 @@ class Checksum(ABC):
     """A checksum that frames carry.
 
     Attributes:
-        order: byte order in which it is sent.
+        order: byte order in which it is sent, ``little`` (its lowest byte first) or ``big``; one byte has none.
     """
 
     width: int

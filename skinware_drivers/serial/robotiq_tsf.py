@@ -8,9 +8,9 @@ send every n ms, synchronous or not, ``E3`` version. ``E2`` starts the bootloade
 
 The check byte is 00 in the maker's program, which does not check it. By an older program (etienne-roberge/
 tactilesensors4, commit 0419b28 of 2021-01-11, ``Communication.h``) it is a CRC-8 of what is behind it, which that
-program does not compute either; its polynomial is not published. The rule is therefore learnt: 00, or one of the usual
-CRC-8. Packets that break it are counted, and still read. A packet with data counts only if the next one begins right
-behind it. Each field becomes a frame: its finger's time u32, values.
+program does not compute either; its polynomial is not published. It is not looked at: a packet with data counts only
+if its fields fill it and the next one begins right behind it. Each field becomes a frame: its finger's time u32,
+values.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ from skinware_drivers import Link, Match, Module, Options, Patch, operation, tax
 from skinware_drivers.fields import Bits, DeviceTime, Identifier
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.checksums import Crc
 from skinware_drivers.serial.framing import Encoding, Field, Framed, Framer, Framing, ReceivedFraming
 from skinware_drivers.serial.packets import Length, Packet
 
@@ -43,17 +42,6 @@ _WITH_DATA = (_READ, _SYNCHRONOUS, _ASYNCHRONOUS)
 _KNOWN = (*_WITH_DATA, _VERSION)
 _HEAD, _BEGINNING, _MOST_DATA = 4, 3, 255
 _TIME, _FINGERS = 7, 2
-_RULES = (
-    None,  # 00
-    *(
-        Crc(width=8, polynomial=polynomial, init=init, reflected_in=reflected, reflected_out=reflected)
-        for polynomial in (0x07, 0x1D, 0x2F, 0x31, 0x39, 0x9B, 0xA7, 0xD5)
-        for init in (0, 0xFF)
-        for reflected in (False, True)
-    ),
-)
-_LEARNT, _FITTING = 16, 12
-"""Packets of which the rule is learnt, and those of them that must fit."""
 _UNTIMED, _ANSWER = 0x400, 0x200
 """Bits of identifiers: a field in a packet without its finger's time; an answer to the command below."""
 _TIMEOUT_S, _TRIES, _FIRST_S = 0.5, 2, 3.0
@@ -104,42 +92,10 @@ class RobotiqPackets(ReceivedFraming):
         return _Packets(self.times)
 
 
-class _CheckByte:
-    """Learns the rule of check bytes, and judges by it; one that most packets break is learnt again."""
-
-    def __init__(self) -> None:
-        self._rule: Crc | None = None
-        self._is_learnt = False
-        self._seen: list[tuple[int, bytes]] = []
-        self._judged: list[bool] = []
-
-    def is_wrong(self, byte: int, covered: bytes) -> bool:
-        if not self._is_learnt:
-            self._seen.append((byte, covered))
-            if len(self._seen) == _LEARNT:
-                fitting = [sum(_keeps(rule, packet) for packet in self._seen) for rule in _RULES]
-                self._is_learnt = max(fitting) >= _FITTING
-                self._rule = _RULES[fitting.index(max(fitting))]
-                self._seen.clear()
-            return False
-        is_wrong = not _keeps(self._rule, (byte, covered))
-        self._judged.append(is_wrong)
-        if len(self._judged) == _LEARNT:
-            self._is_learnt = sum(self._judged) < _FITTING
-            self._judged.clear()
-        return is_wrong
-
-
-def _keeps(rule: Crc | None, packet: tuple[int, bytes]) -> bool:
-    byte, covered = packet
-    return byte == (0 if rule is None else rule.of(covered))
-
-
 class _Packets(Framer):
     def __init__(self, times: bool) -> None:
         super().__init__()
         self._times = times
-        self._check = _CheckByte()
 
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         found: list[Framed] = []
@@ -160,7 +116,6 @@ class _Packets(Framer):
                 done = at + 1
             else:
                 self.counters.frame_bytes += end - at
-                self.counters.checksum_errors += self._check.is_wrong(stream[at + 1], stream[at + 2 : end])
                 found += frames
                 done = end
         self.counters.skipped_bytes += len(stream) - done

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+from importlib.util import find_spec
 from typing import Annotated, Any, ClassVar, NamedTuple
 from urllib.parse import urlsplit
 
@@ -113,7 +114,46 @@ def _mistake(channel: str) -> str:
     return "ports have numbers up to 65535" if port.isdecimal() and int(port) > 65535 else ""
 
 
-class NetworkBus(SerialBus):
+def need_package(what: str, package: str, extra: str) -> None:
+    """Refuse a bus whose package is not installed.
+
+    Raises:
+        ConfigurationError: it is not.
+    """
+    if find_spec(package) is None:
+        raise ConfigurationError(f"{what}: needs the package {package}: pip install 'skinware[{extra}]'")
+
+
+class StreamBus(SerialBus):
+    """A bus that programs or networks carry, with options of its own.
+
+    Raises:
+        ConfigurationError: an option is unknown or has a bad value.
+
+    Attributes:
+        scheme: of its name, ``SCHEME://CHANNEL``.
+    """
+
+    scheme: ClassVar[str]
+    options_class: ClassVar[type[msgspec.Struct]]
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        self._options: Any = options_from_strings(self.options_class, options or {})
+
+    @property
+    def name(self) -> str:
+        return f"bus {self.scheme}:{'' if '://' in self.channel else '//'}{self.channel}"
+
+    @property
+    def baudrate(self) -> int:
+        """0: a network has no baud rate."""
+        return 0
+
+
+class NetworkBus(StreamBus):
     """A serial bus over a network.
 
     Args:
@@ -126,28 +166,16 @@ class NetworkBus(SerialBus):
         needs_host: a host must be given.
     """
 
-    scheme: ClassVar[str]
-    options_class: ClassVar[type[msgspec.Struct]]
     needs_host: ClassVar[bool] = False
 
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options: Any = options_from_strings(self.options_class, options or {})
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         self._address = self._parse(channel)
 
     def _parse(self, channel: str) -> Address:
         return parse_address(self.scheme, channel, needs_host=self.needs_host)
-
-    @property
-    def name(self) -> str:
-        return f"bus {self.scheme}://{self.channel}"
-
-    @property
-    def baudrate(self) -> int:
-        """0: a network has no baud rate."""
-        return 0
 
 
 class ServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -161,26 +189,11 @@ class ServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-class ServerBus(SerialBus):
-    """A program that sends by itself, perhaps to others as well, and is only read.
-
-    Raises:
-        ConfigurationError: an option is unknown or has a bad value.
-    """
+class ServerBus(StreamBus):
+    """A program that sends by itself, perhaps to others as well, and is only read."""
 
     options_class: ClassVar[type[msgspec.Struct]] = ServerOptions
-
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self._options: Any = options_from_strings(self.options_class, options or {})
-        self._heard_ns = 0
-
-    @property
-    def baudrate(self) -> int:
-        """0: a network has no baud rate."""
-        return 0
+    _heard_ns = 0
 
     @property
     def reads_natively(self) -> bool:

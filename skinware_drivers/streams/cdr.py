@@ -1,52 +1,26 @@
 """Find the fields of a message in its bytes (CDR) by its definition, and read numbers without making objects.
 
-Definitions are texts as in ``.msg`` files, by type without ``msg``: ``{"std_msgs/Int8": "int8 data"}``. Plain CDR of
-versions 1 and 2 is read, in both byte orders.
+Plain CDR of versions 1 and 2 is read, in both byte orders.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
+from skinware.ros_types import NUMBERS, TEXT, Definitions
 
 ENCAPSULATION = 4
 _PLAIN_CDR = {b"\0\0": (">", 8), b"\0\1": ("<", 8), b"\0\6": (">", 4), b"\0\7": ("<", 4)}
 """Byte order and greatest alignment, by encapsulation."""
-_CODES = {
-    "bool": "u1",
-    "byte": "u1",
-    "char": "u1",
-    "float32": "f4",
-    "float64": "f8",
-    **{f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)},
-}
-_TEXT = "string"
-_FIELD = re.compile(r"([\w/]+)(<=\d+)?(\[(?:<=)?(\d*)\])?\s+([A-Za-z]\w*)(?:\s+[^=\s].*)?")
-_CONSTANT = re.compile(r"[\w/]+(?:<=\d+)?\s+\w+\s*=.*")
-_EMPTY = "uint8 structure_needs_at_least_one_member"
-_MOST_FIELDS, _DEEPEST = 20_000, 16
+_CODES = {name: np.dtype(name).str[1:] for name in NUMBERS} | {"bool": "u1"}
+_MOST_FIELDS = 20_000
 
 Indices = tuple[int, ...]
 """The elements of sequences within which a field is."""
-
-
-class CdrField(NamedTuple):
-    """A field of a definition.
-
-    Attributes:
-        kind: code of numpy without byte order, ``string``, or another type.
-        length: elements of an array; 0: a sequence; None: one value.
-    """
-
-    name: str
-    kind: str
-    length: int | None
 
 
 class Numbers(NamedTuple):
@@ -68,66 +42,6 @@ class Numbers(NamedTuple):
 
     def of(self, sample: bytes) -> npt.NDArray[Any]:
         return np.frombuffer(sample, self.dtype, self.length, self.start)
-
-
-class Definitions:
-    """Definitions of a type and all that are in it.
-
-    Args:
-        type_name: with or without ``msg``.
-        texts: by type without ``msg``; names in them may leave out the package.
-
-    Attributes:
-        texts: of the types that are used, complete and with nothing but fields.
-
-    Raises:
-        ConfigurationError: a definition is missing or is none.
-    """
-
-    def __init__(self, type_name: str, texts: Mapping[str, str]) -> None:
-        self.type_name = type_name = type_name.replace("/msg/", "/")
-        self.texts: dict[str, str] = {}
-        self._fields: dict[str, Sequence[CdrField]] = {}
-        self._add(type_name, texts, ())
-
-    def __getitem__(self, type_name: str) -> Sequence[CdrField]:
-        return self._fields[type_name]
-
-    def _add(self, type_name: str, texts: Mapping[str, str], outer: tuple[str, ...]) -> None:
-        if type_name in outer or len(outer) > _DEEPEST:
-            raise ConfigurationError(f"type {type_name} is within itself")
-        if type_name in self._fields:
-            return
-        if type_name not in texts:
-            raise ConfigurationError(f"the definition of type {type_name} is missing")
-        fields, lines = [], []
-        for line in map(str.strip, re.sub(r"#.*", "", texts[type_name]).splitlines()):
-            if not line or _CONSTANT.fullmatch(line):
-                continue
-            match = _FIELD.fullmatch(line)
-            if match is None:
-                raise ConfigurationError(f"definition of {type_name}: {line!r} is no field")
-            plain, bound, brackets, length, name = match.groups()
-            kind = plain if plain in _CODES or plain == _TEXT else _qualified(plain, type_name)
-            if "/" in kind:
-                self._add(kind, texts, (*outer, type_name))
-            lines.append(f"{kind}{bound or ''}{brackets or ''} {name}")
-            fields.append(CdrField(name, _CODES.get(kind, kind), _length(brackets, length)))
-        if not fields:  # as ROS does
-            fields, lines = [CdrField("structure_needs_at_least_one_member", "u1", None)], [_EMPTY]
-        self._fields[type_name], self.texts[type_name] = fields, "\n".join([*lines, ""])
-
-
-def _qualified(plain: str, type_name: str) -> str:
-    if plain == "Header":
-        return "std_msgs/Header"
-    return plain.replace("/msg/", "/") if "/" in plain else f"{type_name.rpartition('/')[0]}/{plain}"
-
-
-def _length(brackets: str | None, length: str) -> int | None:
-    if brackets is None:
-        return None
-    return 0 if "<=" in brackets or not length else int(length)
 
 
 class CdrMessage:
@@ -176,20 +90,20 @@ class CdrMessage:
     def _struct(self, type_name: str, path: str, within: Indices) -> None:
         for field in self._definitions[type_name]:
             name = f"{path}.{field.name}" if path else field.name
-            is_number = "/" not in field.kind and field.kind != _TEXT
-            if field.length is not None and not is_number and self._alignment < 8:
+            code = _CODES.get(field.kind)
+            if field.length is not None and not code and self._alignment < 8:
                 self._take(4, 4, name)  # version 2 writes a size before such elements
             count = field.length or (1 if field.length is None else self._size(name))
-            if is_number:
-                size = int(field.kind[1:])
+            if code:
+                size = int(code[1:])
                 start = self._take(min(size, self._alignment) if count else 1, size * count, name)
-                self.numbers.setdefault(name, {})[within] = Numbers(start, count, self._order + field.kind)
+                self.numbers.setdefault(name, {})[within] = Numbers(start, count, self._order + code)
                 continue
             if field.length is not None:
                 self.counts.setdefault(name, {})[within] = count
             for element in range(count):
                 inner = within if field.length is None else (*within, element)
-                if field.kind == _TEXT:
+                if field.kind == TEXT:
                     self._text(name, inner)
                 else:
                     self._struct(field.kind, name, inner)

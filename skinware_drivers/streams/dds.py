@@ -8,19 +8,19 @@ in 10 us u32; the sample with its encapsulation; CRC-32 of everything before it.
 from __future__ import annotations
 
 import logging
-import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import now_ns
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.ros2.transport import HIGHEST_DOMAIN
+from skinware.ros_types import Definitions, dds_name, ros_name
 from skinware_drivers.bus import Bus
 from skinware_drivers.fields import DeviceTime
 from skinware_drivers.options import OptionsT
@@ -31,20 +31,20 @@ from skinware_drivers.serial.framing import Field
 from skinware_drivers.serial.packets import Length, Packet
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import ServerBus
-
-if TYPE_CHECKING:
-    from skinware_drivers.streams.dds_ends import DdsPort
+from skinware_drivers.streams.bus import ServerBus, need_package
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 ENCAPSULATION = 4
 LONGEST = 1 << 20
 """Bytes of the longest sample that is read."""
+_PACKAGE = "cyclonedds", "ros2"
 _SYNC = b"\xdd\x5a"
 _HEAD = struct.Struct("<2sIHI")
-_ROS_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 _STAMP_NS = 10_000
+_MOST_TROUBLES = 16
+_SILENT_NS = 2 * NS_PER_S
+_MOST_PUBLISHERS = 4096
 SOURCE_TIME = DeviceTime(0, "<u4", _STAMP_NS / 1e9)
 """The time at which the publisher wrote a sample, in the body of its record."""
 
@@ -55,24 +55,19 @@ class DdsTopic:
 
     Attributes:
         name: in DDS, which ROS 2 begins with ``rt/``.
-        type_name: as in ROS: ``sensor_msgs/msg/PointCloud2``, which DDS calls ``sensor_msgs::msg::dds_::PointCloud2_``;
-            or with one slash, for types that are not of ROS.
-        texts: definitions as in ``.msg`` files, by type without ``msg``. Publishers whose type is another are not read;
-            a topic can be declared once for each edition of its type, and for each of several types: those are asked
-            for once one of them is published.
+        definitions: of its type. Publishers whose type is another are not read; a topic can be declared once for each
+            edition of its type, and for each of several types: those are asked for once one of them is published.
         number: identifier of its samples, 0 to 65535.
     """
 
     name: str
-    type_name: str
-    texts: Mapping[str, str] = field(hash=False)
+    definitions: Definitions
     number: int = 0
 
     @property
     def dds_type(self) -> str:
         """The name of its type in DDS."""
-        *package, plain = self.type_name.split("/")
-        return f"{'::'.join(package)}::dds_::{plain}_" if len(package) > 1 else f"{package[0]}::{plain}"
+        return dds_name(self.definitions.type_name)
 
 
 @dataclass(frozen=True)
@@ -92,10 +87,8 @@ class HeardTopic:
 
     @property
     def ros_type(self) -> str:
-        """Its type as a :class:`DdsTopic` names it; empty if it is no type of a message."""
-        if match := _ROS_TYPE.fullmatch(self.type_name):
-            return f"{match[1]}/msg/{match[2]}"
-        return self.type_name.replace("::", "/") if re.fullmatch(r"\w+::\w+", self.type_name) else ""
+        """Its type in ROS; empty if it is no type of a message."""
+        return ros_name(self.type_name)
 
 
 def samples(longest: int) -> Packet:
@@ -134,83 +127,161 @@ class DdsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 1024
 
 
-def _need_package(name: str) -> None:
-    if find_spec("cyclonedds") is None:
-        raise ConfigurationError(f"{name}: needs the package cyclonedds: pip install 'skinware[ros2]'")
-
-
 def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    _need_package(f"bus dds://{channel}")
+    need_package(f"bus dds://{channel}", *_PACKAGE)
     from skinware_drivers.streams.dds_ends import DdsDeviceBus
 
     return DdsDeviceBus(channel, options, **more)
 
 
-class TopicBus(ServerBus):
-    """A bus of topics.
+News = tuple[int, str]
+"""Level of logging, and text."""
+
+
+class TopicSource(NamedTuple):
+    """A publisher; ``handle`` is its identity."""
+
+    handle: Hashable
+    topic: str
+    type_name: str
+    came_ns: int
+
+
+@dataclass
+class _ReadSource:
+    """The publisher that is read on a topic, and the number of the reader that matched it."""
+
+    publisher: Hashable
+    reader: int
+    heard_ns: int
+
+
+class TopicPort(Port):
+    """Reads topics, and notes their publishers.
 
     Attributes:
-        topics: to read; :class:`DdsAdapter` sets them.
+        publishers: of all topics there, by handle.
+        dropped: samples so far that found no room.
+        refused: samples so far that were not used.
+        news: of publishers since they were logged last.
     """
 
-    topics: Sequence[DdsTopic] = ()
+    longest_wait = 0
 
-    def heard(self) -> list[HeardTopic]:
-        """Return the topics that are published there, as far as that is known."""
+    def __init__(self, topics: Sequence[DdsTopic]) -> None:
+        self.topics = topics
+        self.publishers: dict[Hashable, TopicSource] = {}
+        self.dropped = self.refused = 0
+        self.news: list[News] = []
+        self._sources: dict[str, _ReadSource] = {}
+
+    def write(self, data: bytes) -> int:
+        """Publish nothing."""
+        return len(data)
+
+    def change(self, topics: Sequence[DdsTopic]) -> None:
+        """Read these topics alone; those that may have several types once one of these is published.
+
+        Raises:
+            BusNotAvailable: one cannot be read.
+        """
         raise NotImplementedError
 
-    def read_only(self, topic: DdsTopic) -> None:
-        """Read another topic in place of all others, from now on."""
+    def look(self, time_ns: int) -> bool:
+        """Note which publishers came or went; return whether any did."""
         raise NotImplementedError
 
+    def judge(self, time_ns: int) -> None:
+        """Add news of publishers that came a while ago and cannot be read."""
 
-class DdsBus(TopicBus):
-    """Topics of a domain. Its name is ``dds://DOMAIN?key=value``, with the number of the domain.
+    def types_of(self, name: str) -> list[str]:
+        """Return the types in DDS that a topic may have."""
+        return [topic.dds_type for topic in self.topics if topic.name == name]
 
-    It joins the domain as one participant, which publishes no topic, and never asks a publisher to send more.
+    def came(self, one: TopicSource) -> bool:
+        """Note a publisher; return whether it is one of a topic to read."""
+        types = self.types_of(one.topic)
+        if one.handle in self.publishers or len(self.publishers) >= _MOST_PUBLISHERS:
+            return False
+        self.publishers[one.handle] = one
+        if types and one.type_name not in types:
+            known = types[0] if len(set(types)) == 1 else f"one of {len(types)} that are known"
+            why = f"its type is {one.type_name}, not {known}"
+            self.news.append((logging.WARNING, f"a publisher of {one.topic} cannot be read: {why}"))
+        elif types:
+            self.news.append((logging.INFO, f"a publisher of {one.topic} is there"))
+            others = sum(each[1:3] == one[1:3] for each in self.publishers.values())
+            if others > 1:
+                self.news.append((logging.WARNING, f"{one.topic} has {others} publishers: only the first is read"))
+        return bool(types)
+
+    def went(self, handle: Hashable) -> None:
+        """Note that a publisher is gone."""
+        gone = self.publishers.pop(handle, None)
+        if gone is not None and self.types_of(gone.topic):
+            self.news.append((logging.INFO, f"a publisher of {gone.topic} is gone"))
+            source = self._sources.get(gone.topic)
+            if source is not None and source.publisher == handle:
+                del self._sources[gone.topic]
+
+    def is_read(self, topic: str, reader: int, publisher: Hashable, time_ns: int) -> bool:
+        """Return whether a sample is of the publisher that is read: the first until it is gone or silent.
+
+        Two readers of a topic, for two editions of its type, match a publisher that does not show its type: one counts.
+        """
+        source = self._sources.get(topic)
+        if source is None or time_ns - source.heard_ns > _SILENT_NS:
+            source = self._sources[topic] = _ReadSource(publisher, reader, time_ns)
+        if source.publisher != publisher:
+            self.refused += 1
+            return False
+        if source.reader == reader:
+            source.heard_ns = time_ns
+        return source.reader == reader
+
+
+class TopicBus(ServerBus):
+    """Topics; nothing is published.
+
     If several programs publish a topic, the first is read until it is gone or silent for 2 s; the samples of the others
     are counted as refused, and those that waited too long as dropped. The log reports publishers that come and go,
-    that are doubled, or that cannot be read because their type or QoS is another.
+    that are doubled, or that cannot be read because their type is another.
 
-    Raises:
-        ConfigurationError: no such domain, an option is unknown or has a bad value, or the package cyclonedds is
-            missing.
+    Attributes:
+        topics: to read; :class:`DdsAdapter` sets them. None: not set.
     """
 
-    options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
-    device_end: ClassVar[Callable[..., Bus] | None] = _device_end
-
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self.domain: int = parse_domain(channel)
-        _need_package(self.name)
-        self._joined: DdsPort | None = None
-
-    @property
-    def name(self) -> str:
-        return f"bus dds://{self.channel}"
+    topics: Sequence[DdsTopic] | None = None
+    _joined: TopicPort | None = None
 
     def check(self) -> None:
-        """Report publishers that cannot be read; that none sends is no reason to join the domain again."""
+        """Report publishers that cannot be read; that none sends is no reason to join again."""
         SerialBus.check(self)
         self._report()
 
     def heard(self) -> list[HeardTopic]:
-        return [] if self._joined is None else self._joined.heard()
+        """Return the topics that are published there, as far as that is known."""
+        port = self._joined
+        if port is None:
+            return []
+        while port.look(now_ns()):
+            pass
+        counts = Counter((one.topic, one.type_name) for one in port.publishers.values())
+        return [HeardTopic(topic, kind, count) for (topic, kind), count in sorted(counts.items())]
 
     def read_only(self, topic: DdsTopic) -> None:
+        """Read another topic in place of all others, from now on."""
         self.topics = [topic]
         if self._joined is not None:
             self._joined.change(self.topics)
 
-    def _open_port(self) -> Port:
-        from skinware_drivers.streams.dds_ends import DdsPort
+    def _join(self, topics: Sequence[DdsTopic]) -> TopicPort:
+        raise NotImplementedError
 
-        if not self.topics:
+    def _open_port(self) -> Port:
+        if self.topics is None:
             raise ConfigurationError(f"{self.name}: this driver reads no topics")
-        self._joined = DdsPort(self.name, self.domain, self._options, self.topics)
+        self._joined = self._join(self.topics)
         return self._joined
 
     def _read(self, port: Port) -> None:
@@ -219,23 +290,55 @@ class DdsBus(TopicBus):
         self._report()
 
     def _report(self) -> None:
-        if self._joined is None or self._port is None:
+        port = self._joined
+        if port is None or self._port is None:
             return
-        dropped, refused = self._joined.take_unused()
-        self.counters.dropped += dropped
-        self.counters.refused += refused
-        for level, text in self._joined.take_news(now_ns()):
+        port.judge(now_ns())
+        self.counters.dropped += port.dropped
+        self.counters.refused += port.refused
+        port.dropped = port.refused = 0
+        news, port.news = port.news, []
+        for level, text in news:
             log.log(level, "%s: %s", self.name, text)
 
 
-def parse_domain(channel: str) -> int:
+class DdsBus(TopicBus):
+    """Topics of a domain. Its name is ``dds://DOMAIN?key=value``, with the number of the domain.
+
+    It joins the domain as one participant, which publishes no topic, and never asks a publisher to send more.
+
+    Raises:
+        ConfigurationError: no such domain, an option is unknown or has a bad value, or the package cyclonedds is
+            missing.
+    """
+
+    scheme: ClassVar[str] = "dds"
+    options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
+    device_end: ClassVar[Callable[..., Bus] | None] = _device_end
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
+        self.domain: int = parse_domain(channel)
+        need_package(self.name, *_PACKAGE)
+
+    def _join(self, topics: Sequence[DdsTopic]) -> TopicPort:
+        from skinware_drivers.streams.dds_ends import DdsPort
+
+        return DdsPort(self.name, self.domain, self._options, topics)
+
+
+def parse_domain(channel: str, scheme: str = "dds") -> int:
     """Return the number of a domain.
 
     Raises:
         ConfigurationError: it is none.
     """
     if not (channel.isascii() and channel.isdecimal() and int(channel[:9]) <= HIGHEST_DOMAIN):
-        raise ConfigurationError(f"bus dds://{channel}: write dds://DOMAIN with a number up to 232, as dds://0")
+        raise ConfigurationError(
+            f"bus {scheme}://{channel}: write {scheme}://DOMAIN with a number up to 232, as {scheme}://0"
+        )
     return int(channel)
 
 
@@ -245,10 +348,21 @@ class DdsAdapter(SerialAdapter[OptionsT]):
     Attributes:
         topics: that it reads, with numbers by which its layout knows them.
         reads_any_name: it reads topics of these types under any name.
+        troubles: with samples that were logged so far.
     """
 
     topics: Sequence[DdsTopic] = ()
     reads_any_name: ClassVar[bool] = False
+
+    def __init__(self, options: OptionsT) -> None:
+        super().__init__(options)
+        self.troubles: list[str] = []
+
+    def log_once(self, text: str) -> None:
+        """Log a trouble with samples; each once, and a few at most."""
+        if text not in self.troubles and len(self.troubles) < _MOST_TROUBLES:
+            self.troubles.append(text)
+            log.warning("%s", text)
 
     def fit(self, bus: Bus) -> None:
         """Give the bus framing and topics.

@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import time
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar
 
+import msgspec
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException, InstanceState
 from cyclonedds.domain import Domain, DomainParticipant
@@ -22,15 +21,15 @@ from cyclonedds.topic import Topic
 from skinware.errors import BridgeError, BusNotAvailable
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.ros2.cyclone import WaitingThread, join, reason, struct_type, write_bytes
-from skinware_drivers.options import options_from_strings
-from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
+from skinware_drivers.streams.bus import StreamBus
 from skinware_drivers.streams.dds import (
     LONGEST,
     SOURCE_TIME,
     DdsOptions,
     DdsTopic,
-    HeardTopic,
+    TopicPort,
+    TopicSource,
     parse_domain,
     record,
     samples,
@@ -38,16 +37,10 @@ from skinware_drivers.streams.dds import (
 
 _AT_ONCE = 16
 """Samples of a topic in one read."""
-_MOST_PUBLISHERS = 256
-_SILENT_NS = 2 * NS_PER_S
 _UNREAD_NS = 5 * NS_PER_S
 """Time after which a publisher that no reader has matched is reported."""
-_MOST_LISTED = 4096
 _ALL_BITS = (1 << 64) - 1
 """Handles of matched publishers have a sign, those of samples have none."""
-
-News = tuple[int, str]
-"""Level of logging, and text."""
 
 
 class _Bytes(bytes):
@@ -56,24 +49,7 @@ class _Bytes(bytes):
     sample_info: Any
 
 
-@dataclass
-class _Publisher:
-    topic: str
-    type_name: str
-    came_ns: int
-    is_judged: bool = False
-
-
-@dataclass
-class _HeardPublisher:
-    """The publisher that is heard on a topic, and the number of the reader that matched it."""
-
-    publisher: int
-    reader: int
-    heard_ns: int
-
-
-class DdsPort(Port):
+class DdsPort(TopicPort):
     """A participant that reads topics.
 
     Args:
@@ -84,15 +60,11 @@ class DdsPort(Port):
         ConfigurationError: both the bus and ``CYCLONEDDS_URI`` choose networks.
     """
 
-    longest_wait = 0
-
     def __init__(self, name: str, domain: int, options: DdsOptions, topics: Sequence[DdsTopic]) -> None:
-        self._name, self._topics, self._options = name, topics, options
-        self._heard: dict[int, tuple[str, str]] = {}
-        self._sources: dict[str, _HeardPublisher] = {}
-        self._publishers: dict[int, _Publisher] = {}
-        self._news: list[News] = []
-        self._refused = self._rejected = self._rejected_before = 0
+        super().__init__(topics)
+        self._name, self._options = name, options
+        self._unjudged: deque[TopicSource] = deque()
+        self._rejected = 0
         self._domain, self._participant = _joined(name, domain, options)
         self._readers: dict[int, DataReader] = {}
         with _as_bus_error(name):
@@ -104,22 +76,14 @@ class DdsPort(Port):
         return self._waiting.event
 
     def change(self, topics: Sequence[DdsTopic]) -> None:
-        """Read these topics alone; those that may have several types once one of these is published.
-
-        Raises:
-            BusNotAvailable: one cannot be read.
-        """
-        self._topics = topics
+        self.topics, self._rejected = topics, 0
         with _as_bus_error(self._name):
             for number in tuple(self._readers):
                 self._waiting.forget(self._readers.pop(number))
+            published = {(one.topic, one.type_name) for one in self.publishers.values()}
             for number, topic in enumerate(topics):
-                if len(set(self._types_of(topic.name))) == 1 or (topic.name, topic.dds_type) in self._heard.values():
+                if len(set(self.types_of(topic.name))) == 1 or (topic.name, topic.dds_type) in published:
                     self._subscribe(number)
-
-    def heard(self) -> list[HeardTopic]:
-        """Return the topics that are published."""
-        return _counted(self._heard.values())
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
         """Return records of samples that have come, at most a few of each topic.
@@ -129,17 +93,14 @@ class DdsPort(Port):
         """
         self._waiting.calm_down()
         time_ns = now_ns()
+        self.look(time_ns)
         with _as_bus_error(self._name):
-            self._look(time_ns)
             records = [one for number in tuple(self._readers) for one in self._take(number, time_ns)]
-            readers = self._readers.values()
-            self._rejected = sum(reader.get_sample_rejected_status().total_count for reader in readers)
+            rejected = sum(reader.get_sample_rejected_status().total_count for reader in self._readers.values())
+        self.dropped += rejected - self._rejected
+        self._rejected = rejected
         self._waiting.go_on.set()
         return b"".join(records)
-
-    def write(self, data: bytes) -> int:
-        """Publish nothing."""
-        return len(data)
 
     def close(self) -> None:
         self._waiting.close()
@@ -147,130 +108,63 @@ class DdsPort(Port):
         del self._publications, self._participant
         self._domain = None
 
-    def take_unused(self) -> tuple[int, int]:
-        """Return how many samples found no room since the last call, and how many were of further publishers."""
-        unused = self._rejected - self._rejected_before, self._refused
-        self._rejected_before, self._refused = self._rejected, 0
-        return unused
-
-    def take_news(self, time_ns: int) -> list[News]:
-        """Return the news of publishers since the last call; those that came a while ago must have been matched."""
-        matched: set[int] | None = None
-        for publisher, one in self._publishers.items():
-            if one.is_judged or time_ns - one.came_ns < _UNREAD_NS:
-                continue
-            one.is_judged = True
+    def judge(self, time_ns: int) -> None:
+        """Add news of publishers that no reader has matched a while after they came."""
+        while self._unjudged and time_ns - self._unjudged[0].came_ns >= _UNREAD_NS:
+            one = self._unjudged.popleft()
             with _as_bus_error(self._name):
                 readers = self._readers.values()
                 matched = {each & _ALL_BITS for reader in readers for each in reader.get_matched_publications()}
-            if publisher not in matched and one.type_name in self._types_of(one.topic):
-                self._tell(
-                    f"a publisher of {one.topic} cannot be read: its type {one.type_name} has another structure, or it"
-                    " does not offer the qos that is asked for",
-                    logging.WARNING,
-                )
-        news, self._news = self._news, []
-        return news
+            is_there = self.publishers.get(one.handle) is one
+            if is_there and one.handle not in matched and one.type_name in self.types_of(one.topic):
+                why = f"its type {one.type_name} has another structure, or it does not offer the qos that is asked for"
+                self.news.append((logging.WARNING, f"a publisher of {one.topic} cannot be read: {why}"))
 
-    def _types_of(self, name: str) -> list[str]:
-        return [topic.dds_type for topic in self._topics if topic.name == name]
-
-    def _tell(self, text: str, level: int = logging.INFO) -> None:
-        self._news.append((level, text))
-
-    def _look(self, time_ns: int) -> None:
-        """Note which publishers of the topics came or went."""
-        for one in self._publications.take(_AT_ONCE):
-            publisher = one.sample_info.instance_handle
-            if one.sample_info.valid_data and one.sample_info.instance_state == InstanceState.Alive:
-                if len(self._heard) < _MOST_LISTED:
-                    self._heard[publisher] = one.topic_name, one.type_name
-                if publisher not in self._publishers and self._types_of(one.topic_name):
-                    self._welcome(publisher, _Publisher(one.topic_name, one.type_name, time_ns))
-                continue
-            self._heard.pop(publisher, None)
-            if (gone := self._publishers.pop(publisher, None)) is not None:
-                self._tell(f"a publisher of {gone.topic} is gone")
-                source = self._sources.get(gone.topic)
-                if source is not None and source.publisher == publisher:
-                    del self._sources[gone.topic]
-
-    def _welcome(self, publisher: int, one: _Publisher) -> None:
-        if len(self._publishers) >= _MOST_PUBLISHERS:
-            return
-        self._publishers[publisher] = one
-        types = self._types_of(one.topic)
-        for number, topic in enumerate(self._topics):
-            if (topic.name, topic.dds_type) == (one.topic, one.type_name) and number not in self._readers:
-                self._subscribe(number)
-        if one.type_name not in types:
-            known = types[0] if len(set(types)) == 1 else f"one of {len(types)} that are known"
-            self._tell(
-                f"a publisher of {one.topic} cannot be read: its type is {one.type_name}, not {known}",
-                logging.WARNING,
-            )
-            return
-        self._tell(f"a publisher of {one.topic} is there")
-        others = sum(
-            1 for each in self._publishers.values() if (each.topic, each.type_name) == (one.topic, one.type_name)
-        )
-        if others > 1:
-            self._tell(f"{one.topic} has {others} publishers: only the first is read", logging.WARNING)
+    def look(self, time_ns: int) -> bool:
+        with _as_bus_error(self._name):
+            found = self._publications.take(_AT_ONCE)
+            for one in found:
+                handle = one.sample_info.instance_handle
+                if not one.sample_info.valid_data or one.sample_info.instance_state != InstanceState.Alive:
+                    self.went(handle)
+                elif self.came(publisher := TopicSource(handle, one.topic_name, one.type_name, time_ns)):
+                    self._unjudged.append(publisher)
+                    for number, topic in enumerate(self.topics):
+                        if (topic.name, topic.dds_type) == publisher[1:3] and number not in self._readers:
+                            self._subscribe(number)
+        return bool(found)
 
     def _subscribe(self, number: int) -> None:
         depth = self._options.depth
         qos = _qos(self._options, Policy.History.KeepAll, Policy.ResourceLimits(depth, 1, depth))
-        reader = DataReader(self._participant, _topic(self._participant, self._topics[number]), qos)
+        reader = DataReader(self._participant, _topic(self._participant, self.topics[number]), qos)
         self._readers[number] = reader
         self._waiting.watch(reader)
 
     def _take(self, number: int, time_ns: int) -> Iterator[bytes]:
-        topic = self._topics[number]
+        topic = self.topics[number]
         for sample in self._readers[number].take(_AT_ONCE):
             if not isinstance(sample, _Bytes):
                 continue
             if len(sample) > LONGEST:
-                self._refused += 1
-            elif self._is_heard(topic.name, number, sample.sample_info, time_ns):
+                self.refused += 1
+            elif self.is_read(topic.name, number, sample.sample_info.publication_handle, time_ns):
                 yield record(topic.number, sample.sample_info.source_timestamp, sample)
 
-    def _is_heard(self, name: str, reader: int, info: Any, time_ns: int) -> bool:
-        """Return whether a sample is of the publisher that is read, which the first is until it is gone or silent.
 
-        Two readers of a topic, for two editions of its type, match a publisher that does not show its type: one counts.
-        """
-        source = self._sources.get(name)
-        if source is None or time_ns - source.heard_ns > _SILENT_NS:
-            source = self._sources[name] = _HeardPublisher(info.publication_handle, reader, time_ns)
-        if source.publisher != info.publication_handle:
-            self._refused += 1
-            return False
-        if source.reader == reader:
-            source.heard_ns = time_ns
-        return source.reader == reader
-
-
-class DdsDeviceBus(SerialBus):
+class DdsDeviceBus(StreamBus):
     """The devices' end, for emulators: ``skin-emulate --bus dds://DOMAIN`` publishes the records that it is given.
 
     Attributes:
         topics: to publish, by the numbers of records; the first of each number, where there are several.
     """
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
-        self.topics: Sequence[DdsTopic] = ()
-        self._options = options_from_strings(DdsOptions, options or {})
-        self._domain = parse_domain(channel)
-
-    @property
-    def name(self) -> str:
-        return f"bus dds://{self.channel}"
+    scheme: ClassVar[str] = "dds"
+    options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
+    topics: Sequence[DdsTopic] = ()
 
     def _open_port(self) -> Port:
-        return _PublishingPort(self.name, self._domain, self._options, self.topics)
+        return _PublishingPort(self.name, parse_domain(self.channel), self._options, self.topics)
 
 
 class _PublishingPort(Port):
@@ -315,32 +209,6 @@ class _PublishingPort(Port):
             self._event = -1
 
 
-def heard_topics(channel: str, options: dict[str, str], duration_s: float) -> list[HeardTopic]:
-    """Join a domain for a while, and return the topics that are published there; nothing is asked or published.
-
-    Raises:
-        BusNotAvailable: the domain cannot be joined.
-        ConfigurationError: no such domain, or an option is unknown or has a bad value.
-    """
-    name = f"bus dds://{channel}"
-    domain, participant = _joined(name, parse_domain(channel), options_from_strings(DdsOptions, options))
-    with _as_bus_error(name):
-        publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-        time.sleep(duration_s)
-        found = _counted(
-            (one.topic_name, one.type_name)
-            for one in publications.read(_MOST_LISTED)
-            if one.sample_info.valid_data and one.sample_info.instance_state == InstanceState.Alive
-        )
-    del publications, participant, domain
-    return found
-
-
-def _counted(published: Iterable[tuple[str, str]]) -> list[HeardTopic]:
-    """Return topics and types of publishers, each once with the number of its publishers."""
-    return [HeardTopic(topic, kind, count) for (topic, kind), count in sorted(Counter(published).items())]
-
-
 @contextlib.contextmanager
 def _as_bus_error(name: str) -> Iterator[None]:
     try:
@@ -364,6 +232,6 @@ def _qos(options: DdsOptions, *policies: Any) -> Qos:
 
 def _topic(participant: DomainParticipant, topic: DdsTopic) -> Any:
     """Return a topic whose samples stay bytes."""
-    made = struct_type(topic.type_name, topic.texts)
+    made = struct_type(topic.definitions)
     made.deserialize = made.deserialize_key = _Bytes
     return Topic(participant, topic.name, made)

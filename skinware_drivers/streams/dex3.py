@@ -13,7 +13,6 @@ pad says to be lost, and a status byte for each value.
 
 from __future__ import annotations
 
-import logging
 import struct
 from collections.abc import Iterable, Sequence
 from typing import Annotated, Literal
@@ -23,6 +22,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
+from skinware.ros_types import Definitions
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
@@ -35,8 +35,6 @@ from skinware_drivers.polling import Notice
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.stream import Split
 from skinware_drivers.streams.dds import ENCAPSULATION, SOURCE_TIME, DdsAdapter, DdsTopic, samples
-
-log: logging.Logger = logging.getLogger("skinware.driver")
 
 _SIDES = ("left", "right")
 _STATE = "unitree_hg/msg/HandState"
@@ -55,7 +53,8 @@ _TEXTS = {
         "uint32[2] error\nuint32[2] reserve\n"
     ),
 }
-_EDITIONS = (_TEXTS, _TEXTS | {"unitree_hg/PressSensorState": "float32[12] pressure\nfloat32[12] temperature\n"})
+_OLD_PAD = {"unitree_hg/PressSensorState": "float32[12] pressure\nfloat32[12] temperature\n"}
+_EDITIONS = Definitions(_STATE, _TEXTS), Definitions(_STATE, _TEXTS | _OLD_PAD)
 _BEGINNINGS = {"full": "rt/dex3", "low": "rt/lf/dex3"}
 
 _MOTORS, _TAXELS, _MOST_PADS = 7, 12, 16
@@ -74,14 +73,11 @@ _LEAST_VALID, _NO_READING = 100_000, 30_000
 _PAD = 0x100
 """Identifier of a pad's frame: this, hand << 4, pad."""
 _FIRST_S, _LISTEN_S, _AGAIN_S = 5.0, 0.25, 5.0
-_MOST_TOLD = 16
 
 
 def _topics(beginning: str, sides: Sequence[str]) -> list[DdsTopic]:
     return [
-        DdsTopic(f"{beginning}/{side}/state", _STATE, texts, _SIDES.index(side))
-        for side in sides
-        for texts in _EDITIONS
+        DdsTopic(f"{beginning}/{side}/state", edition, _SIDES.index(side)) for side in sides for edition in _EDITIONS
     ]
 
 
@@ -159,7 +155,6 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         self._lost = np.full((len(_SIDES), options.pads), -1, np.int64)  # as the pads count; -1: not known yet
         self._numbers = np.zeros((len(_SIDES), options.pads), np.int64)
         self._totals = np.zeros((len(_SIDES), options.pads), np.int64)
-        self._told: list[str] = []
         self._described: Sequence[Patch] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
@@ -232,7 +227,7 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
             if hands:
                 return hands | new
             hands = new
-        why = f" that fit ({self._told[-1]})" if self._told else ""
+        why = f" that fit ({self.troubles[-1]})" if self.troubles else ""
         raise BusError(f"{link.bus_name}: no samples of a hand{why} within {_FIRST_S:g} s")
 
     def _split(self, hand: int, body: bytes) -> Iterable[tuple[int, bytes]]:
@@ -240,7 +235,7 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         sample = body[SOURCE_TIME.end :]
         wrong = self._misfit(sample) if hand < len(_SIDES) else "a topic that is not known"
         if wrong:
-            self._tell(f"{_SIDES[hand & 1]} hand: {wrong}")
+            self.log_once(f"{_SIDES[hand & 1]} hand: {wrong}")
             return [(_PAD | (hand & 1) << 4, body[: SOURCE_TIME.end])]
         pads = np.frombuffer(sample, self._sizes[len(sample)], self.options.pads, _PADS)
         rows = np.zeros(len(pads), _ROW)
@@ -277,13 +272,8 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         self._lost[hand] = now
         self._totals[hand] += more
         for pad in np.flatnonzero((more > 0) & (self._totals[hand] == more)).tolist():
-            self._tell(f"{_SIDES[hand]} hand: pad {pad} loses data (logged once)")
+            self.log_once(f"{_SIDES[hand]} hand: pad {pad} loses data (logged once)")
         return more
-
-    def _tell(self, text: str) -> None:
-        if text not in self._told and len(self._told) < _MOST_TOLD:
-            self._told.append(text)
-            log.warning("%s", text)
 
 
 def _status(pads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import struct
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +21,7 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.geometry import Geometry
+from skinware.ros_types import Definitions
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
@@ -32,19 +33,17 @@ from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.stream import Split
-from skinware_drivers.streams.cdr import CdrMessage, Definitions
+from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.dds import LONGEST, SOURCE_TIME, DdsAdapter, DdsTopic, TopicBus, samples
 from skinware_drivers.streams.ros2_map import guessed, preset, read_map, texts_of
 from skinware_drivers.streams.ros2_parts import MOST_VALUES, Making, ModulePart, Plan
 from skinware_drivers.streams.ros2_presets import PRESETS, TEXTS
 
-log: logging.Logger = logging.getLogger("skinware.driver")
-
 _TYPES = 64
 """Numbers of a topic: one for each type that it may have; the last is that of a map."""
 _MOST_TOPICS, _MOST_PARTS, _MOST_LISTED = 128, 190, 20
 _NEWS, _NO_MESSAGE = 0, 0x7FF
-_FIRST_S, _LISTEN_S, _AGAIN_S, _MOST_TOLD = 5.0, 0.05, 5.0, 16
+_FIRST_S, _LISTEN_S, _AGAIN_S = 5.0, 0.05, 5.0
 _LIST_EVERY = 64
 _NUMBER = struct.Struct("<H")
 _DTYPES = (np.uint8, np.int16, np.uint16, np.int32, np.float32)
@@ -94,15 +93,14 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         super().__init__(options)
         self.period_s: float = options.period_ms / 1e3
         self.geometry: Geometry | None = None
-        self._reading = {topic.number: (definitions, making) for topic, definitions, making in _topics(options)}
-        self.topics = [topic for topic, *_ in _topics(options)]
+        self._reading = {topic.number: (topic, making) for topic, making in _topics(options)}
+        self.topics = [topic for topic, _ in self._reading.values()]
         self.framing: Framing = Split(samples(LONGEST), self._split)
         self._plans: dict[int, Plan] = {}
         self._parts: dict[Key, tuple[int, ModulePart]] = {}
         self._uids: dict[Key, int] = {}
         self._identifiers: dict[Key, tuple[int, Any]] = {}
         self._described: Sequence[Patch] = ()
-        self._told: set[str] = set()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Learn the modules of the first messages.
@@ -155,7 +153,7 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
             if heard and known is None:
                 known = texts_of(heard[0], definitions)
                 self.change_framing(Split(samples(LONGEST), keep))
-                self._line.read_only(DdsTopic(name, heard[0], known.texts, _TYPES - 1))
+                self._line.read_only(DdsTopic(name, known, _TYPES - 1))
             if kept and known is not None:
                 text = guessed(_in_ros(name), heard[0], CdrMessage(kept[0], known), known)
                 await asyncio.to_thread(Path(file).write_text, text, encoding="utf-8")
@@ -186,9 +184,9 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
             for part in plan.parts:
                 key = part.patch, part.name
                 if self._parts.get(key, (number, part))[0] != number:
-                    self._tell(f"{part.name} of {part.patch} is in two topics: one is shown")
+                    self.log_once(f"{part.name} of {part.patch} is in two topics: one is shown")
                 elif key not in self._parts and len(self._parts) >= _MOST_PARTS:
-                    self._tell(f"more than {_MOST_PARTS} modules: {part.name} of {part.patch} is not shown")
+                    self.log_once(f"more than {_MOST_PARTS} modules: {part.name} of {part.patch} is not shown")
                 else:
                     self._parts[key] = number, part
 
@@ -237,7 +235,7 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         """Return why nothing is shown, and which topics there are."""
         names = sorted({topic.name for topic in self.topics})
         why = f"no messages on {', '.join(map(_in_ros, names))} within {_FIRST_S:g} s"
-        why += f" that fit ({'; '.join(sorted(self._told))})" if self._told else ""
+        why += f" that fit ({'; '.join(sorted(self.troubles))})" if self.troubles else ""
         if not isinstance(self._line, TopicBus):
             return why
         heard = self._line.heard()
@@ -256,7 +254,8 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
             try:
                 plan = self._plan(number, sample)
             except (ValueError, KeyError) as error:
-                self._tell(f"a message of {self._name(number)}: {error}")
+                topic, _ = self._reading.get(number, (None, None))
+                self.log_once(f"a message of {_in_ros(topic.name) if topic else f'topic {number}'}: {error}")
                 return [(self._identifier_of(number), stamp)]
             plan.listed = _LIST_EVERY if self._is_known(plan) else 0
         plan.messages += 1
@@ -282,45 +281,34 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
     def _plan(self, number: int, sample: bytes) -> Plan:
         if number not in self._reading:
             raise ValueError("a topic that is not known")
-        definitions, making = self._reading[number]
-        message = CdrMessage(sample, definitions)
-        plan, before = Plan(message, making(message, self._name(number))), self._plans.get(number)
+        topic, making = self._reading[number]
+        message = CdrMessage(sample, topic.definitions)
+        plan, before = Plan(message, making(message, _in_ros(topic.name))), self._plans.get(number)
         plan.messages = before.messages if before else 0
         self._plans[number] = plan
         return plan
 
-    def _name(self, number: int) -> str:
-        return next((_in_ros(topic.name) for topic in self.topics if topic.number == number), f"topic {number}")
 
-    def _tell(self, text: str) -> None:
-        if text not in self._told and len(self._told) < _MOST_TOLD:
-            self._told.add(text)
-            log.warning("%s", text)
-
-
-def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Definitions, Making]]:
-    """Return topics to read, each once for each type that it may have.
+def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Making]]:
+    """Return topics to read, each once for each type that it may have, and what makes parts of their messages.
 
     Raises:
         ConfigurationError: too many, or a type or the map is wrong.
     """
     found = []
     if options.map:
-        for ordinal, (mapped, definitions, making) in enumerate(read_map(options.map)):
-            number = ordinal * _TYPES + _TYPES - 1
-            topic = DdsTopic(_in_dds(mapped.name), mapped.type, definitions.texts, number)
-            found.append((topic, definitions, making))
+        for ordinal, (name, definitions, making) in enumerate(read_map(options.map)):
+            found.append((DdsTopic(_in_dds(name), definitions, ordinal * _TYPES + _TYPES - 1), making))
     else:
         for ordinal, text in enumerate(options.topic):
             name, _, type_name = text.partition("=")
             for number, (known, making) in enumerate(PRESETS.items()):
                 if not type_name or known == type_name:
-                    definitions = Definitions(known, TEXTS)
-                    topic = DdsTopic(_in_dds(name), known, definitions.texts, ordinal * _TYPES + number)
-                    found.append((topic, definitions, making))
+                    topic = DdsTopic(_in_dds(name), Definitions(known, TEXTS), ordinal * _TYPES + number)
+                    found.append((topic, making))
             if type_name:
                 preset(type_name)
-    if not found or len({topic.name for topic, *_ in found}) > _MOST_TOPICS:
+    if not found or len({topic.name for topic, _ in found}) > _MOST_TOPICS:
         raise ConfigurationError(f"give 1 to {_MOST_TOPICS} topics")
     return found
 
@@ -348,14 +336,12 @@ def _places(part: ModulePart, position_m: npt.NDArray[np.float64], first_uid: in
     normal = np.full((n, 3), np.nan) if part.normal is None else part.normal
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.divide(normal, length, out=np.full((n, 3), np.nan), where=length > 0)
-    return Geometry(
-        type_name=np.repeat(np.array([each.name for each in part.types], object), n),
-        uid=np.tile(np.arange(first_uid, first_uid + n, dtype=np.uint64), k),
+    uid = np.tile(np.arange(first_uid, first_uid + n, dtype=np.uint64), k)
+    return replace(
+        Geometry.unknown(np.repeat([each.name for each in part.types], n).tolist(), uid),
         frame=np.full(k * n, part.frame, object),
         position_m=np.tile(position_m, (k, 1)),
         normal=np.tile(normal, (k, 1)),
-        radius_m=np.full(k * n, np.nan),
-        confidence=np.full(k * n, np.nan),
     )
 
 
@@ -367,4 +353,4 @@ def _in_ros(name: str) -> str:
     return name.removeprefix("rt")
 
 
-Ros2Driver.topics = [topic for topic, *_ in _topics(Ros2Options())]
+Ros2Driver.topics = [topic for topic, _ in _topics(Ros2Options())]

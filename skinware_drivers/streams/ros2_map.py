@@ -33,9 +33,10 @@ from pathlib import Path
 import msgspec
 
 from skinware.errors import ConfigurationError
+from skinware.ros_types import Definitions
 from skinware.text import nearest_name
 from skinware.toml_text import TomlText
-from skinware_drivers.streams.cdr import CdrMessage, Definitions
+from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.ros2_parts import FieldRule, Making, by_rules
 from skinware_drivers.streams.ros2_presets import PRESETS, TEXTS
 
@@ -44,9 +45,7 @@ _NOT_SHOWN = re.compile(r"(^|\.)(header|stamp|\w*stamp|time|seq|id|\w*_id|index)
 _AXES = re.compile(r"(.*[._])?([xyz])")
 
 
-class MapTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A topic, its type in ROS (as ``std_msgs/msg/Float32MultiArray``), and the meaning of its fields."""
-
+class _MapTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     type: str
     values: tuple[FieldRule, ...] = ()
@@ -55,12 +54,12 @@ class MapTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class _TopicMapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     format: str
     version: int
-    topic: tuple[MapTopic, ...]
+    topic: tuple[_MapTopic, ...]
     definition: dict[str, str] = {}
 
 
-def read_map(path: str) -> list[tuple[MapTopic, Definitions, Making]]:
-    """Return topics, with the definitions of their types and what makes parts of their messages.
+def read_map(path: str) -> list[tuple[str, Definitions, Making]]:
+    """Return names of topics, with the definitions of their types and what makes parts of their messages.
 
     Raises:
         ConfigurationError: the file cannot be read, or says something that cannot be; the message says where.
@@ -75,7 +74,7 @@ def read_map(path: str) -> list[tuple[MapTopic, Definitions, Making]]:
             making = by_rules(*topic.values) if topic.values else preset(topic.type)
         except ConfigurationError as error:
             raise ConfigurationError(f"{text.place(('topic', number, 'type'))}: {error}") from None
-        found.append((topic, definitions, making))
+        found.append((topic.name, definitions, making))
     return found
 
 

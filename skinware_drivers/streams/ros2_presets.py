@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from skinware import ros_types
 from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.ros2_parts import (
     FieldRule,
@@ -48,22 +49,14 @@ _INSPIRE: Mapping[str, tuple[str, int | tuple[int, int]]] = {
 }
 
 TEXTS: Mapping[str, str] = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    **ros_types.TEXTS,
     "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
     "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n",
     **{f"std_msgs/{name}": f"{name.lower()} data\n" for name in _NUMBERS},
     **{f"std_msgs/{name}MultiArray": f"std_msgs/MultiArrayLayout layout\n{name.lower()}[] data\n" for name in _NUMBERS},
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n",
     "geometry_msgs/WrenchStamped": _HEADER + "geometry_msgs/Wrench wrench\n",
-    "sensor_msgs/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count\n",
-    "sensor_msgs/PointCloud2": _HEADER
-    + "uint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\nuint32 point_step\n"
-    "uint32 row_step\nuint8[] data\nbool is_dense\n",
-    "sensor_msgs/Image": _HEADER
-    + "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n",
     "sensor_msgs/FluidPressure": _HEADER + "float64 fluid_pressure\nfloat64 variance\n",
     "sensor_msgs/MagneticField": _HEADER
     + "geometry_msgs/Vector3 magnetic_field\nfloat64[9] magnetic_field_covariance\n",

@@ -4,32 +4,27 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.errors import BusNotAvailable
 from skinware.realtime import now_ns
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.streams.bus import ServerBus, parse_address, split_url
+from skinware_drivers.streams.bus import ServerBus, need_package, parse_address, split_url
 
 if TYPE_CHECKING:
     from skinware_drivers.streams.websocket_ends import WebSocketPort
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
+_PACKAGE = "websockets", "websocket"
 _HTTP = 80
 _MOST_MESSAGES = 256
 """Messages of a take, before other buses get their turn."""
 
 
-def _need_package(name: str) -> None:
-    if find_spec("websockets") is None:
-        raise ConfigurationError(f"{name}: needs the package websockets: pip install 'skinware[websocket]'")
-
-
 def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    _need_package(f"bus websocket:{channel}")
+    need_package(f"bus websocket:{channel}", *_PACKAGE)
     from skinware_drivers.streams.websocket_ends import WebSocketServerBus
 
     return WebSocketServerBus(channel, options, **more)
@@ -46,20 +41,17 @@ class WebSocketBus(ServerBus):
         ConfigurationError: no such URL, an option is unknown or has a bad value, or the package websockets is missing.
     """
 
+    scheme: ClassVar[str] = "websocket"
     device_end: ClassVar[Callable[..., Bus] | None] = _device_end
 
     def __init__(
         self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        _need_package(self.name)
+        need_package(self.name, *_PACKAGE)
         self._address = parse_address("ws", split_url(channel), default_port=_HTTP)
         self._web: WebSocketPort | None = None
         self._unusable = 0
-
-    @property
-    def name(self) -> str:
-        return f"bus websocket:{self.channel}"
 
     def open(self) -> None:
         """Connect; a message that came with the server's greeting is read at once.

@@ -232,15 +232,11 @@ class ServingPort(Port):
 class WebSocketServerBus(NetworkBus):
     """The device's end, for emulators: ``skin-emulate --bus websocket:ws://HOST:PORT``. ``note`` shows the address."""
 
-    scheme: ClassVar[str] = "ws"
+    scheme: ClassVar[str] = "websocket"
     options_class: ClassVar[type[msgspec.Struct]] = ServerOptions
 
     def _parse(self, channel: str) -> Address:
-        return parse_address(self.scheme, split_url(channel), needs_host=False)
-
-    @property
-    def name(self) -> str:
-        return f"bus websocket:{self.channel}"
+        return parse_address("ws", split_url(channel), needs_host=False)
 
     def _open_port(self) -> Port:
         return ServingPort(self._address, self._options.patience_s)

@@ -277,6 +277,7 @@ class YarpBus(ServerBus):
         ConfigurationError: no such name, or an option is unknown or has a bad value.
     """
 
+    scheme: ClassVar[str] = "yarp"
     device_end: ClassVar[Callable[..., Bus] | None] = YarpServerBus
 
     def __init__(
@@ -284,10 +285,6 @@ class YarpBus(ServerBus):
     ) -> None:
         super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
         self._server, self._name = split_channel(channel)
-
-    @property
-    def name(self) -> str:
-        return f"bus yarp://{self.channel}"
 
     def _open_port(self) -> Port:
         server = NameServer(*(self._server or configured_server()))

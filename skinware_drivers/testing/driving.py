@@ -128,7 +128,12 @@ def driving_lines(
         publish: see :class:`skinware_drivers.running.runner.Runner`.
         wait_for_buses: see :class:`skinware_drivers.running.runner.Runner`.
         bus_names: names of the buses; default: bus0, bus1 ...
+
+    Raises:
+        ConfigurationError: an adapter's declarations are not complete, as for the command ``skin-driver``.
     """
+    for adapter, _ in lines:
+        adapter.check()
     running = Driving(lines, name, bus_names, listen_only=listen_only, publish=publish, wait_for_buses=wait_for_buses)
     running.start()
     try:

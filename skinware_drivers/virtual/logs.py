@@ -7,7 +7,7 @@ import logging
 import re
 import struct
 from collections.abc import Iterator
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import Any, BinaryIO, NamedTuple, Protocol, Self
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
@@ -25,6 +25,21 @@ _PCAP = {0xA1B2C3D4: 1000, 0xA1B23C4D: 1}
 """By magic number: ns of a unit of the fractions of times."""
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _ORDER, _NAME, _RESOLUTION, _FLAGS, _OUTBOUND = 0x1A2B3C4D, 2, 9, 2, 2
+
+
+class WireSource(Protocol):
+    """A recorded bus: a :class:`skinware.recording.WireTrack`, or one of a log."""
+
+    @property
+    def driver(self) -> str: ...
+
+    @property
+    def bus(self) -> str: ...
+
+    @property
+    def is_serial(self) -> bool: ...
+
+    def items(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WireItem]: ...
 
 
 class LogFile:

@@ -7,10 +7,11 @@ come from the recording, and the driver need not ask.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import msgspec
 
@@ -31,7 +32,7 @@ from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock
 from skinware_drivers.virtual.hardware import WireFrame
 from skinware_drivers.virtual.line import EmulatedLine, EmulatedPort
-from skinware_drivers.virtual.logs import LogFile
+from skinware_drivers.virtual.logs import LogFile, WireSource
 from skinware_drivers.virtual.recorded_wire import SENT, Note, RecordedWire
 
 if TYPE_CHECKING:
@@ -41,27 +42,15 @@ if TYPE_CHECKING:
 _MCAP = b"\x89MCAP"
 
 
-class WireSource(Protocol):
-    """A recorded bus: a :class:`skinware.recording.WireTrack`, or one of a log."""
-
-    @property
-    def driver(self) -> str: ...
-
-    @property
-    def bus(self) -> str: ...
-
-    @property
-    def is_serial(self) -> bool: ...
-
-    def items(self, *, start_s: float = 0.0, end_s: float | None = None) -> Iterator[WireItem]: ...
-
-
 class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of a recorded bus."""
 
     bus: Annotated[str, msgspec.Meta(description="name of the bus, if several were recorded")] = ""
     driver: Annotated[str, msgspec.Meta(description="driver of the bus, if several had it")] = ""
-    speed: Annotated[float, msgspec.Meta(description="2: twice as fast", gt=0)] = 1.0
+    speed: Annotated[
+        Annotated[float, msgspec.Meta(gt=0)] | Literal["max"],
+        msgspec.Meta(description="2: twice as fast; max: as fast as the driver decodes, without losses"),
+    ] = 1.0
     start: Annotated[float, msgspec.Meta(description="where to begin, s since the recording began", ge=0)] = 0.0
     end: Annotated[
         Annotated[float, msgspec.Meta(ge=0)] | None,
@@ -103,7 +92,8 @@ class RecordedPort(EmulatedPort):
         return b"" if frame is None else frame.payload
 
     def next_frame(self) -> WireFrame | None:
-        self._unread += self._hardware.emit(self._clock())
+        if not self._unread:
+            self._unread += self._hardware.emit(self._clock())
         frame = self._unread.popleft() if self._unread else None
         self._wake_when_due()
         if frame is not None:
@@ -263,14 +253,12 @@ class ReplayedModbusBus(ModbusBus):
             port.close()
 
 
-_CLASSES: dict[str, type[Bus]] = {"serial": ReplayedSerialBus, "modbus": ReplayedModbusBus}
-
-
 def _class_of(channel: str, options: dict[str, str]) -> type[Bus]:
     wanted = options_from_strings(ReplayOptions, options)
     with _open(channel, wanted.bus) as recording:
         medium = medium_of(recording, wire_of(recording, wanted.bus, wanted.driver))
-        return _CLASSES.get(medium, ReplayedCanBus)
+    classes: dict[str, type[Bus]] = {"serial": ReplayedSerialBus, "modbus": ReplayedModbusBus}
+    return classes.get(medium, ReplayedCanBus)
 
 
 @chosen_by(_class_of)
@@ -303,14 +291,15 @@ def replayed_bus(
     wire = wire_of(recording, wanted.bus, wanted.driver)
     name = f"replay:{channel} ({wire.bus})"
     items = _items(recording, wire, wanted)
-    of_driver = [one for one in recording.wires if one.driver == wire.driver]
-    first_ns = first_of(of_driver, wanted.start)
+    first_ns = first_of([one for one in recording.wires if one.driver == wire.driver], wanted.start)
     more: dict[str, Any] = {"payload_size": payload_size, "listen_only": listen_only, "clock": clock}
-    play = partial(RecordedWire, items, first_ns, speed=wanted.speed, name=name, note=note)
-    if medium_of(recording, wire) == "modbus":
+    speed = math.inf if wanted.speed == "max" else wanted.speed
+    play = partial(RecordedWire, items, first_ns, speed=speed, name=name, note=note)
+    medium = medium_of(recording, wire)
+    if medium == "modbus":
         hardware = play(waits=False, with_sent=True)
         return ReplayedModbusBus(name, hardware=hardware, over_tcp=_was_over_tcp(wire.items()), **more)
-    kind = ReplayedSerialBus if medium_of(recording, wire) == "serial" else ReplayedCanBus
+    kind = ReplayedSerialBus if medium == "serial" else ReplayedCanBus
     return kind(name, hardware=play(waits=not listen_only), **more)
 
 
@@ -384,8 +373,7 @@ def wire_of(recording: Recording | LogFile, bus: str = "", driver: str = "") -> 
     if len(found) == 1:
         return found[0]
     there_are = ", ".join(f"bus={wire.bus}&driver={wire.driver}".removesuffix("&driver=") for wire in wires)
-    of_driver = f" of {driver}" if driver else ""
-    what = "which bus?" if found else f"no bus {bus}{of_driver};"
+    what = "which bus?" if found else f"no bus {bus}{f' of {driver}' if driver else ''};"
     raise ConfigurationError(f"{recording.path}: {what} there are: {there_are}")
 
 

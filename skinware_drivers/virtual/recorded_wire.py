@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import math
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
@@ -26,6 +28,8 @@ _EARLIEST_NS = 250_000_000
 _ANSWERED_WITHIN_NS = 20_000_000
 """Longest time from a question to its answer; a later one was read late, or this device is slow."""
 _MOST_QUESTIONS = 1000
+_AT_ONCE = 2048
+"""Items that are returned together where nothing but room limits them."""
 
 
 class Questions:
@@ -86,7 +90,7 @@ class RecordedWire:
 
     Args:
         first_ns: time of the recording, in its CLOCK_MONOTONIC, at which it begins.
-        speed: 2.0: twice as fast.
+        speed: 2.0: twice as fast; infinite: each item as soon as there is room for it, at the time of the caller.
         waits: for the questions that were asked in the recording.
         with_sent: return sent items too, with the identifier :data:`SENT`.
         name: for the log message at the end; empty: none.
@@ -111,7 +115,7 @@ class RecordedWire:
         self._with_sent, self._name, self._note = with_sent, name, note
         self._questions = Questions(waits=waits)
         self._next: WireItem | None = None
-        self._begun_ns = self._given_ns = self._looked_ns = 0
+        self._begun_ns = self._given_ns = self._looked_ns = self._reached_ns = 0
         self._has_begun = self.is_over = False
         self._counts = {"frames": 0, "bursts": 0, "commands": 0}
 
@@ -137,7 +141,10 @@ class RecordedWire:
     def emit(self, now_ns: int) -> list[WireFrame]:
         found: list[WireFrame] = []
         self._looked_ns = now_ns
-        while (item := self._next) is not None and (self._due_ns(item) <= now_ns or self._hurry(item, now_ns)):
+        most = _AT_ONCE if math.isinf(self._speed) else sys.maxsize
+        while (item := self._next) is not None and len(found) < most:
+            if self._due_ns(item) > now_ns and not self._hurry(item, now_ns):
+                break
             if item.is_sent:
                 if self._questions.is_awaited(item) and not self._is_asked(item, now_ns):
                     break
@@ -156,10 +163,10 @@ class RecordedWire:
         return found
 
     def skip(self, now_ns: int) -> int:
-        """Begin; later, leave out what is due."""
+        """Begin; later, leave out what is due: nothing, if items only wait for room."""
         if self._has_begun:
-            return len(self.emit(now_ns))
-        self._has_begun, self._begun_ns = True, now_ns
+            return 0 if math.isinf(self._speed) else len(self.emit(now_ns))
+        self._has_begun, self._begun_ns, self._looked_ns = True, now_ns, now_ns
         self._take_next()
         return 0
 
@@ -167,6 +174,8 @@ class RecordedWire:
         return dict(self._counts)
 
     def _due_ns(self, item: WireItem) -> int:
+        if math.isinf(self._speed):
+            return self._reached_ns
         return self._begun_ns + round((item.time_ns - self._first_ns) / self._speed)
 
     def _given(self, item: WireItem, identifier: int) -> WireFrame:
@@ -206,7 +215,7 @@ class RecordedWire:
         return True
 
     def _take_next(self) -> None:
-        self._next = next(self._items, None)
+        self._next, self._reached_ns = next(self._items, None), self._looked_ns
         if self._next is None and not self.is_over:
             self.is_over = True
             if self._name:

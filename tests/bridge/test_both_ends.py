@@ -44,7 +44,7 @@ def until_appeared(ends: Ends, writer: DriverWriter, value: int | None = 1) -> N
         publish(writer, value)
         try:
             with DriverReader(writer.name, namespace=ends.here) as reader:
-                return bool(reader.latest) and not reader.read().stale
+                return bool(reader.newest_position) and not reader.read().stale
         except Exception:  # noqa: BLE001, not there yet
             return False
 
@@ -243,7 +243,7 @@ def test_a_frame_that_was_published_long_ago_is_here(ends: Ends) -> None:
     with driver(ends.there) as writer:
         publish(writer, 11)
         with serving(ends.net, ends.there), reader(ends) as there:
-            wait_until(lambda: there.latest is not None and int(there.read().values[0]) == 11)
+            wait_until(lambda: there.newest_position is not None and int(there.read().values[0]) == 11)
 
 
 def test_a_pause_is_seen_here(ends: Ends) -> None:
@@ -292,7 +292,7 @@ def test_operations_are_those_of_the_robot(ends: Ends) -> None:
         thread.start()
         try:
             with ServiceReader("pump", namespace=ends.here, timeout_s=PATIENCE_S) as there:
-                wait_until(lambda: there.latest is not None)
+                wait_until(lambda: there.newest_position is not None)
                 assert there.operations() == {"tare": "Take the present load as none.", "fail": "Never works."}
                 assert there.call("tare", gently=True, timeout_s=PATIENCE_S) == {"tared": 3, "gently": True}
                 assert device.called == [{"gently": True}]

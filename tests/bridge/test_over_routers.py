@@ -101,7 +101,9 @@ def test_robots_of_two_labs_meet(namespace: Namespace) -> None:
             until_told(listed, "walle")
             route.wait_for("status", lambda event: event["robots"] == {"walle": 1})
             with DriverReader("arm", namespace=here, timeout_s=PATIENCE_S) as arm:
-                wait_until(lambda: arm.latest is not None and bool(arm.read().fresh("pressure").all()), PATIENCE_S)
+                wait_until(
+                    lambda: arm.newest_position is not None and bool(arm.read().fresh("pressure").all()), PATIENCE_S
+                )
             with ServiceReader("pump", namespace=here, timeout_s=PATIENCE_S) as service:
                 assert service.call("tare", timeout_s=PATIENCE_S) == "tared"
 
@@ -127,7 +129,7 @@ def test_a_router_says_who_may_serve_and_who_may_call(namespace: Namespace, tmp_
         for who in ("guest", "icub"):
             with joining("icub", here, port, *tls[who]):
                 with ServiceReader("pump", namespace=here, timeout_s=PATIENCE_S) as service:
-                    wait_until(lambda service=service: service.latest is not None, PATIENCE_S)  # type: ignore[misc]
+                    wait_until(lambda service=service: service.newest_position is not None, PATIENCE_S)  # type: ignore[misc]
                     if who == "guest":
                         with pytest.raises(RequestFailed, match="no answer from robot icub"):
                             service.call("tare", timeout_s=PATIENCE_S)

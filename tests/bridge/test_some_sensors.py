@@ -105,7 +105,7 @@ def here_as(ends: Ends, writer: DriverWriter, condition: Callable[[DriverReader]
         publish(writer)
         try:
             with DriverReader(writer.name, namespace=ends.here) as reader:
-                return reader.latest is not None and condition(reader)
+                return reader.newest_position is not None and condition(reader)
         except Exception:  # noqa: BLE001, not there yet
             return False
 

@@ -200,7 +200,7 @@ def kill(process: subprocess.Popen[bytes]) -> None:
 def _has_published(name: str, pid: int) -> bool:
     try:
         with DriverReader(name, announce=False) as reader:
-            return reader.writer_pid == pid and reader.latest is not None
+            return reader.writer_pid == pid and reader.newest_position is not None
     except ServiceError:
         return False
 

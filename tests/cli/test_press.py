@@ -62,7 +62,7 @@ def test_an_emulator_takes_presses_by_a_service_and_tells_where_it_is_pressed(
         hand.wait_for("ready")
         with ServiceReader("hand") as reader:
             assert reader.operations() == {"press": "Press the emulated skin at a place for a while."}
-            wait_until(lambda: reader.latest is not None)
+            wait_until(lambda: reader.newest_position is not None)
             assert reader.read().column("count")[0] == 0
             told = pressed(capsys, "0.19", "0", "-0.0125", "--seconds", "60")
             assert told.startswith(f"hand on {BUS}: 3 N for 60 s; the nearest taxel: board 10")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -9,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from skinware import DriverWriter, ServiceWriter
+from skinware.memory.locks import Descriptor
 
 SMALL = {"values": ("<u8", 512)}
 
@@ -17,6 +19,20 @@ def publish(writer: ServiceWriter | DriverWriter, value: int) -> None:
     """A frame whose every value is this."""
     writer.begin()["values"][:] = value
     writer.commit(time.monotonic_ns())
+
+
+@contextmanager
+def at_0(descriptor: Descriptor) -> Iterator[None]:
+    """The descriptor is 0, as in a program without a standard input."""
+    before, descriptor_before = os.dup(0), descriptor.fd
+    os.dup2(descriptor.fd, 0, inheritable=False)
+    descriptor.fd = 0
+    try:
+        yield
+    finally:
+        descriptor.fd = descriptor_before
+        os.dup2(before, 0)
+        os.close(before)
 
 
 def add(a: float, b: float) -> float:

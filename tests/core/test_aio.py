@@ -181,14 +181,14 @@ def test_a_killed_writer_is_told_of_and_its_successor_is_found() -> None:
                 kill(process)
                 with pytest.raises(ServiceTimeout, match="its writer is dead"):
                     await soon(_all(reader.samples(timeout_s=0.1)))
-                task = asyncio.create_task(reader.read(newer_than=reader.sync.latest, timeout_s=60))
+                task = asyncio.create_task(reader.read(newer_than=reader.sync.newest_position, timeout_s=60))
                 await until_asleep()
                 with FakeSkin("fake") as fake:
                     fake.publish()
                     assert (await soon(task)).sequence == 1
                     fake.writer.restructure(fake_structure(1, 1))
                     with pytest.raises(StructureChanged):
-                        await soon(reader.read(newer_than=reader.sync.latest, timeout_s=60))
+                        await soon(reader.read(newer_than=reader.sync.newest_position, timeout_s=60))
                     with pytest.raises(StructureChanged):
                         await soon(_all(reader.samples(200)))
 

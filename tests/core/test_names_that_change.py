@@ -75,7 +75,7 @@ def test_its_reader_says_that_it_changed_and_reattach_says_what_it_is(
         die(first)
         with successor("b") as other:
             publish(other, 1)
-            assert reader.latest == frame.position
+            assert reader.newest_position == frame.position
             assert reader.read().stale
             with pytest.raises(StructureChanged):
                 reader.read(newer_than=frame)

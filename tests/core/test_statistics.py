@@ -136,7 +136,7 @@ def test_a_reader_tells_what_its_loop_does(namespace: Namespace) -> None:
 
 def _lags(reader: ServiceReader[Sample], frame: Sample) -> bool:
     """Whether the next frame will be lost."""
-    generation, sequence = reader.latest or frame.position
+    generation, sequence = reader.newest_position or frame.position
     return generation == frame.generation and sequence >= frame.sequence + 2
 
 

@@ -56,7 +56,7 @@ def test_nothing_is_wrong_with_a_healthy_one(tmp_path: Path) -> None:
         with emulated_skin("roboskin", name="torso", boards=(7, 8)) as skin, recording(file) as recorder:
             has(recorder, "torso")
             for _ in range(15):
-                skin.reader.read(newer_than=skin.reader.latest)
+                skin.reader.read(newer_than=skin.reader.newest_position)
         evidence, findings = seen(file)
         kept.append(evidence)
         return list(findings.values())

@@ -40,7 +40,7 @@ def examples(few: int) -> settings:
         max_examples=EXAMPLES or few,
         derandomize=not EXAMPLES,
         suppress_health_check=list(HealthCheck),
-        phases=[Phase.explicit, Phase.reuse, Phase.generate, Phase.shrink],
+        phases=[phase for phase in settings().phases if phase not in (Phase.target, Phase.explain)],
         report_multiple_bugs=False,
         deadline=None,
     )

@@ -390,15 +390,17 @@ def test_times_that_do_not_overlap(made: Made, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "one column must have the time, as one of: time_ns, unix_s, monotonic_ns, time_s"),
+        ("", "no line with numbers in it"),
+        ("a\n1\n", "one column must have the time, as one of: time_ns, unix_s, monotonic_ns, time_s"),
         ("a,b\n1,2\n", "one column must have the time"),
         ("time_s,time_ns,a\n1,2,3\n", "one column must have the time"),
-        ("time_s,a\n", "no rows in it"),
+        ("time_s,a\n", "no line with numbers in it"),
         ("time_s\n1\n", "no columns of numbers"),
-        ("time_s,a\n0,1\n0.5,2,3\n", "line 3: 3 columns instead of 2"),
-        ("time_s,a,b\n0,1,x\n1,1,1\n", "b is not numbers; choose columns: FEATURE=FILE:COLUMN"),
+        ("time_s,a\n0,1\n0.5,2,3\n", "line 3: 3 cells instead of 2"),
+        ("time_s,a,b\n0,1,x\n1,1,x\n", "b is not numbers; choose columns: FEATURE=FILE:COLUMN"),
+        ("time_s,a,b\n0,1,x\n1,1,1\n", "line 2: 'x' is no number"),
         ("time_s,a\n0,1\n1,nan\n", "a is not a finite number in row 2"),
-        ("time_s,a\nx,1\n1,1\n", "time_s is not numbers"),
+        ("time_s,a\n0,1\nx,1\n", "line 3: 'x' is no number"),
         ("time_s,a\nnan,1\n1,1\n", "time_s is not numbers"),
         ("time_s,a\n0,1\n1,1\n0.5,1\n", "time goes back after row 2"),
         ("time_s,a\n0,1\n0.4,1\n0.8,1\n", r"nothing within 0\.0333 s at or before .* the first at 0\.067 s of"),
@@ -413,10 +415,10 @@ def test_files_that_cannot_be_joined_are_one_line(made: Made, tmp_path: Path, te
     assert sorted(each.name for each in tmp_path.iterdir()) == ["joints.csv", "walk.mcap"]
 
 
-@pytest.mark.parametrize("name", ["joints.npz", "joints.parquet", "joints.txt"])
-def test_what_is_damaged_is_one_line(made: Made, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(("name", "begin"), [("joints.npz", "PK"), ("joints.parquet", "PAR1"), ("joints.npy", "a\0")])
+def test_what_is_damaged_is_one_line(made: Made, tmp_path: Path, name: str, begin: str) -> None:
     with pytest.raises(ConfigurationError, match=name) as raised:
-        learn(made, joined(tmp_path, "time_s,a\n0,1\n", name))
+        learn(made, joined(tmp_path, f"{begin}time_s,a\n0,1\n", name))
     assert "\n" not in str(raised.value)
 
 

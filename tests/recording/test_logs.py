@@ -19,10 +19,12 @@ from skinware.recording import Series
 from skinware.recording.wire import export_pcapng
 from skinware.status import Status
 from skinware.wire import ERROR, EXTENDED, IS_FD, REMOTE, WireItem
+from skinware_drivers.bus import FrameBatch
 from skinware_drivers.cli.capturing import only_listened
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.logs import LogFile
 from skinware_drivers.virtual.recorded import replayed_bus
 from tests.recording.rig import recording
@@ -191,6 +193,38 @@ def test_a_log_that_is_damaged_later_ends_there(tmp_path: Path, caplog: pytest.L
     (wire,) = LogFile(str(path)).wires
     assert len(list(wire.items())) == before
     assert [record.message.partition(": damaged")[0] for record in caplog.records] == [f"{path}, line {before + 1}"]
+
+
+def test_a_log_at_full_speed_is_read_completely(tmp_path: Path) -> None:
+    """100,000 frames of 2 s without a clock that goes, and with one that jumps between two reads."""
+    n = 100_000
+    path = tmp_path / "long.log"
+    path.write_text("".join(f"({1 + at / 50_000:.6f}) can0 {at % 0x700:03X}#{at:08X}\n" for at in range(n)))
+    for jump_ns in (0, 10**10):
+        clock = HandClock()
+        bus = replayed_bus(str(path), {"speed": "max"}, listen_only=True, clock=clock)
+        bus.open()
+        batch = FrameBatch.for_buses(1, 8)
+        found: list[int] = []
+        while len(found) < n and bus.receive(batch, 0):
+            rows = batch.wire[batch.start : batch.stop]
+            found += rows["payload"][:, :4].copy().view(">u4")[:, 0].tolist()
+            assert (batch.time_ns[batch.start : batch.stop] <= clock.now_ns).all()
+            batch.clear()
+            clock.pass_to(clock.now_ns + jump_ns)
+        assert found == list(range(n))
+        assert bus.counters.dropped == 0
+        bus.close()
+
+
+def test_a_driver_reads_all_of_a_log_at_full_speed(tmp_path: Path) -> None:
+    n, path = 20_000, tmp_path / "xela.log"
+    path.write_text("".join(f"({1 + at / 1000:.6f}) can0 {0x101 + at % 4:03X}#{at:016X}\n" for at in range(n)))
+    kind = load_driver("xela")
+    bus = make_bus(f"file:{path}?speed=max", listen_only=True)
+    with driving_lines([(kind(kind.Options()), bus)], "skin", listen_only=True):
+        wait_until(lambda: bus.counters.frames == n)
+        assert bus.counters.dropped == 0
 
 
 def exported(capture: Path, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -179,6 +180,18 @@ def test_speed() -> None:
     wire = RecordedWire(iter([item(0, 1), item(10, 2), item(30, 3)]), 7_000 * MS, speed=2.0)
     wire.skip(0)
     assert emitted(wire, 30) == [(0, 1), (5, 2), (15, 3)]
+
+
+def test_at_full_speed_only_questions_are_waited_for() -> None:
+    items = [item(0, 1), item(900, 2), item(1800, 0x10, is_sent=True), item(2700, 3), item(3600, 4)]
+    wire = RecordedWire(iter(items), 7_000 * MS, speed=math.inf)
+    wire.skip(5 * MS)
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(6 * MS)] == [(5 * MS, 1), (6 * MS, 2)]
+    assert wire.emit(7 * MS) == []
+    assert wire.skip(500 * MS) == 0
+    wire.receive(0x10, b"", 600 * MS)
+    assert wire.next_due_ns() == 600 * MS
+    assert [(frame.time_ns, frame.identifier) for frame in wire.emit(601 * MS)] == [(601 * MS, 3), (601 * MS, 4)]
 
 
 def test_an_answer_comes_after_its_question_with_the_same_delay() -> None:

@@ -6,11 +6,14 @@ it looks for none elsewhere.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import queue
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,7 +109,26 @@ def _trigger(sdk: Any, port: int, service: str) -> Any:
     return {"hash": type_hash, "answer": _plain(answer)}
 
 
+def _publish(sdk: Any, port: int, topic: str, count: int, domain: int) -> Any:
+    """Publish, as long as the process lives, arrays of ``count`` numbers that rise by one each 10 ms."""
+    type_name = "std_msgs/msg/Float32MultiArray"
+    for name in ("std_msgs/msg/MultiArrayDimension", "std_msgs/msg/MultiArrayLayout", type_name):
+        sdk.get_registry().load_message_type(name)
+    definition = sdk.get_registry().get_msg_file_path(type_name).read_text()
+    publisher = sdk.ROS2Publisher(topic, type_name, definition, domain_id=domain, router_port=port)
+    layout = sdk.get_message_class("std_msgs/msg/MultiArrayLayout")(dim=[], data_offset=0)
+
+    def run() -> None:
+        for number in itertools.count():
+            publisher.publish(layout=layout, data=np.arange(number, number + count, dtype=np.float32))
+            time.sleep(0.01)
+
+    threading.Thread(target=run, daemon=True).start()
+    return publisher.keyexpr
+
+
 _ANSWERS: dict[str, Callable[..., Any]] = {
+    "publish": _publish,
     "topics": _topics,
     "services": _services,
     "message": _message,

@@ -17,7 +17,7 @@ import pytest
 from skinware import DriverReader, Namespace
 from skinware.conversion.showing import in_topic
 from skinware.errors import BridgeError, ConfigurationError
-from skinware.ros2 import dds, messages
+from skinware.ros2 import cyclone, dds, messages
 from skinware.ros2.transport import Distro, NodeIdentity, Qos
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
@@ -152,7 +152,7 @@ def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: 
 
 @pytest.mark.thorough
 def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
-    monkeypatch.setattr(dds, "_write_bytes", None)
+    monkeypatch.setattr(cyclone, "write_bytes", None)
     node = dds.DdsNode(NodeIdentity("skin", domain=domain))
     try:
         with peer(domain, "--listen", "rt/x", messages.SKIN_FRAME.name) as theirs:

@@ -82,7 +82,7 @@ class EveryFrame:
         def and_read(publish: Callable[..., None]) -> Callable[..., None]:
             def call(*arguments: Any) -> None:
                 publish(*arguments)
-                while self.reader.latest != (self.taken[-1].position if self.taken else None):
+                while self.reader.newest_position != (self.taken[-1].position if self.taken else None):
                     self.taken.append(next(frames))
 
             return call

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal, NamedTuple
 
 import pytest
@@ -13,13 +14,16 @@ from hypothesis import strategies as st
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.decoder import PATCH_COUNTERS
-from skinware_drivers.description import Module, Patch, assemble, taxels
+from skinware_drivers.description import Module, Patch, SkinTables, assemble, taxels
 from skinware_drivers.fields import Bits, Identifier, SequenceNumber
 from skinware_drivers.layout import Cycle, Frame, Layout, Values
+from tests.specification.both_paths import Pair, hand_clock
 from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000
 PERIOD_NS = 20 * MS
+USUAL_NS = 26 * MS
+"""Of a device that is slower than it should be."""
 MODULES = 2
 Order = Literal["given", "any", "ends_with"]
 
@@ -45,7 +49,7 @@ class Device:
     maximum_age_ns: int
 
     @property
-    def decoder(self) -> SpecifiedDecoder:
+    def skin(self) -> tuple[Layout, SkinTables]:
         frames = [
             Frame(
                 f"part {place}",
@@ -60,9 +64,27 @@ class Device:
         cycle = Cycle([f.name for f in frames], self.maximum_age_ns / 1e9, self.within, self.order, counter)
         modules = [Module(taxels(self.members, first_uid=10 * key), key=key) for key in range(MODULES)]
         types = [PRESSURE.measured(unit="counts")]
-        return SpecifiedDecoder(
-            [Layout(frames, cycle)], assemble([("bus", [Patch("p", modules)])], types, "i4"), [0.02]
-        )
+        return Layout(frames, cycle), assemble([("bus", [Patch("p", modules)])], types, "i4")
+
+    @property
+    def decoder(self) -> SpecifiedDecoder:
+        layout, tables = self.skin
+        return SpecifiedDecoder([layout], tables, [0.02])
+
+    def wire(self, frame: Sent) -> tuple[int, bytes]:
+        """Identifier and payload."""
+        payload = bytes([0xAA, frame.cycle % self.modulo << 4 | 5]) + frame.serial.to_bytes(4, "little") + bytes(2)
+        return 0x100 | frame.place << 4 | frame.module, payload
+
+    def join_in_c(self, sent: Sequence[Sent], cuts: Sequence[int] = ()) -> None:
+        """Fail unless C does the same as numpy."""
+        layout, tables = self.skin
+        with hand_clock() as clock, Pair(clock, [layout], tables, [0.02]) as pair:
+            begin_ns = clock.now_ns
+            for begin, end in zip([0, *cuts], [*cuts, len(sent)], strict=True):
+                frames = [(0, begin_ns + frame.time_ns, *self.wire(frame)) for frame in sent[begin:end]]
+                clock.now_ns = max([clock.now_ns, *(time_ns for _, time_ns, *_ in frames)])
+                pair.feed(frames)
 
     def joined(self, sent: Sequence[Sent], cuts: Sequence[int] = ()) -> tuple[list[list[int]], dict[str, int]]:
         """Serial numbers of the frames of each update, in the order of their places; and the patch's counters.
@@ -76,10 +98,7 @@ class Device:
         for begin, end in zip([0, *cuts], [*cuts, len(sent)], strict=True):
             decoder.put_back(batch)
             for frame in sent[begin:end]:
-                payload = (
-                    bytes([0xAA, frame.cycle % self.modulo << 4 | 5]) + frame.serial.to_bytes(4, "little") + bytes(2)
-                )
-                batch.append(0, frame.time_ns, 0x100 | frame.place << 4 | frame.module, payload)
+                batch.append(0, frame.time_ns, *self.wire(frame))
             updates, _ = decoder.decode(batch)
             found += updates.values[updates.whole].tolist()
         return sorted(found), dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
@@ -206,6 +225,56 @@ def test_cycles_are_those_that_an_oracle_finds_wherever_batches_end(data: st.Dat
     assert joined == expected
     assert counters["orphans"] == orphans
     assert counters["updates"] == len(joined)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_cycles_in_c_are_the_same_wherever_batches_end(data: st.DataObject) -> None:
+    device = data.draw(devices((1, 4, 16)))
+    device.join_in_c(*data.draw(streams(device, 8)))
+
+
+def paces(device: Device) -> list[int]:
+    """Times between two cycles: each bound of what is in time, and a nanosecond beside it."""
+    reach_ns = device.maximum_age_ns * (2 if device.order == "any" else 1)
+    margin_ns = (PERIOD_NS - reach_ns) // 8
+    beside_ns = (PERIOD_NS - reach_ns) // 2
+    bounds = [device.maximum_age_ns + margin_ns, PERIOD_NS]
+    bounds += [2 * usual_ns - reach_ns - margin_ns for usual_ns in (PERIOD_NS, USUAL_NS)]
+    for count in (2, 3):
+        bounds += [count * PERIOD_NS + step for step in (-beside_ns, 0, beside_ns)]
+    return [bound + step for bound in bounds for step in (-1, 0, 1)]
+
+
+def paced(device: Device) -> Iterator[list[Sent]]:
+    """Cycles of one module, of which one or one of its frames comes after such a time."""
+    for usual_ns, pace_ns, shares in product((PERIOD_NS, USUAL_NS), paces(device), ((1, 1), (1, 0), (0, 1))):
+        sent, times_ns = [], [MS, 2 * MS]
+        for cycle, spacing_ns in enumerate((0, usual_ns, pace_ns, PERIOD_NS, PERIOD_NS)):
+            for place in range(2):
+                times_ns[place] += spacing_ns if cycle != 2 or shares[place] else PERIOD_NS
+                sent.append(Sent(times_ns[place], 0, place, cycle, 0))
+        sent.sort(key=lambda frame: frame.time_ns)
+        yield [frame._replace(serial=number) for number, frame in enumerate(sent)]
+
+
+@pytest.mark.parametrize(("order", "modulo"), [("given", 1), ("given", 16), ("any", 1), ("ends_with", 1)])
+def test_a_frame_is_in_time_up_to_the_nanosecond(order: Order, modulo: int) -> None:
+    device = Device(2, order, "module", modulo, PERIOD_NS // 4)
+    for sent in paced(device):
+        joined, counters = device.joined(sent)
+        assert (joined, counters["orphans"]) == oracle(device, sent), sent
+    device.join_in_c(*one_after_the_other(paced(device)))
+
+
+def one_after_the_other(streams: Iterable[Sequence[Sent]]) -> tuple[list[Sent], list[int]]:
+    """Streams in one, each a batch, many periods after the one before."""
+    joined, cuts, begin_ns = list[Sent](), [], 0
+    for sent in streams:
+        joined += [frame._replace(time_ns=frame.time_ns + begin_ns) for frame in sent]
+        cuts.append(len(joined))
+        begin_ns = joined[-1].time_ns + 50 * PERIOD_NS
+    return joined, cuts
 
 
 @pytest.mark.thorough

@@ -62,40 +62,6 @@ def test_what_is_no_packet(bad: bytes) -> None:
     assert framer.counters.refused > 0
 
 
-def _crc8(data: bytes, polynomial: int) -> int:
-    value = 0
-    for byte in data:
-        value ^= byte
-        for _ in range(8):
-            value = value << 1 ^ (polynomial | 0x100 if value & 0x80 else 0)
-    return value
-
-
-@pytest.mark.parametrize("rule", ["00", "CRC-8", "CRC-8 of Dallas' polynomial", "none that is known"])
-def test_broken_check_bytes_are_counted_and_their_packets_read(rule: str) -> None:
-    """The rule is learnt of the first packets; it changes once, too."""
-    rng = np.random.default_rng(1)
-
-    def checked(number: int, *, is_broken: bool = False) -> bytes:
-        made = packet(b"\x60" + number.to_bytes(2, "big"))
-        of_rule = {"00": 0, "CRC-8": _crc8(made[2:], 0x07), "CRC-8 of Dallas' polynomial": _crc8(made[2:], 0x31)}
-        check = of_rule.get(rule, int(rng.integers(256)))
-        return made[:1] + bytes([check ^ is_broken]) + made[2:]
-
-    framer = RobotiqPackets().framer()
-    for number in range(200):
-        framer.feed(checked(number, is_broken=number >= 100 and number % 10 == 0))
-    counters = framer.counters
-    assert counters.checksum_errors == (0 if rule.startswith("none") else 10)
-    assert counters.frame_bytes == 199 * 7
-    for number in range(200):
-        framer.feed(packet(b"\x60" + number.to_bytes(2, "big")))
-    assert counters.checksum_errors <= 10 + 2 * 16
-    before = counters.checksum_errors
-    framer.feed(packet(b"\x60\0\0", check=7) + NEXT)
-    assert counters.checksum_errors == before + 1
-
-
 @pytest.mark.parametrize(("step", "unit_s"), [(10, 1e-3), (10_000, 1e-6), (10_000_000, 1e-9), (77, None), (0, None)])
 def test_the_unit_of_the_time_is_learnt(step: int, unit_s: float | None) -> None:
     assert _unit_of({0: [(number * 10_000_000, number * step & 0xFFFF_FFFF) for number in range(50)]}) == unit_s

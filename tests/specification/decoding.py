@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.samples import Unused
-from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
+from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Form, KeyField
 from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
-from skinware_drivers.decoding.decoder import NONE_YET, Decoder, SkinState, Updates, read_numbers
+from skinware_drivers.decoding.decoder import NONE_YET, PATCH_COUNTERS, Decoder, SkinState, Updates, read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import Byte, SequenceNumber
@@ -61,7 +61,6 @@ def slots_of(addresses: Addresses, bus: npt.NDArray[np.uint16], identifier: npt.
 
 def _look_up(form: Form, bus: npt.NDArray[np.uint16], identifier: Indices, slots: Indices, rows: Indices) -> None:
     match = bus == form.bus
-    match &= (identifier & EXTENDED_FLAG) != 0
     for condition in form.conditions:
         match &= identifier & condition.mask == condition.value
     hits = np.flatnonzero(match)
@@ -278,8 +277,8 @@ class SpecifiedDecoder(Decoder):
         if not len(pairs.rows):
             return []
         module, whole = entry[pairs.rows[:, 0]], pairs.whole
-        self._count_patches(1, module[~whole])
-        self._count_patches(2, entry[pairs.late])
+        self._count_patches("orphans", module[~whole])
+        self._count_patches("late", entry[pairs.late])
         self._count_haste(entry[pairs.soon], module[whole])
         if cycle.sequence is not None:
             member, sequence = cycle.sequence
@@ -318,7 +317,7 @@ class SpecifiedDecoder(Decoder):
         )
         if len(unreadable):
             whole = self._count_unreadable(batch, rows, module, unreadable, whole)
-        self._count_patches(0, module[whole])
+        self._count_patches("updates", module[whole])
         oldest_ns = newest_ns = time_ns[rows[:, 0]]
         last_row = rows[:, 0]
         for member in range(1, rows.shape[1]):
@@ -336,18 +335,19 @@ class SpecifiedDecoder(Decoder):
         spoilt, n_frames = np.unique(unreadable, return_counts=True)
         bus = batch.bus[batch.start + rows[unreadable, 0]]
         self.state.bus_counters[:, 2] += np.bincount(bus, minlength=len(self.state.bus_counters))
-        self._count_patches(1, np.repeat(module[spoilt], rows.shape[1] - n_frames))
+        self._count_patches("orphans", np.repeat(module[spoilt], rows.shape[1] - n_frames))
         whole = whole.copy()
         whole[spoilt] = False
         return whole
 
-    def _count_patches(self, counter: int, module: Indices) -> None:
+    def _count_patches(self, counter: str, module: Indices) -> None:
         patch = self._module_patch[module]
-        self.state.patch_counters[:, counter] += np.bincount(patch, minlength=self._n_patches)
+        self.state.patch_counters[:, PATCH_COUNTERS.index(counter)] += np.bincount(patch, minlength=self._n_patches)
 
     def _compare(self, sequence: SequenceNumber | None, payload: Bytes, module: Indices) -> None:
         if sequence is not None and len(module):
-            for counter, found in enumerate(self._numbers(sequence, payload, module), start=3):
+            first = PATCH_COUNTERS.index("sequence_lost")
+            for counter, found in enumerate(self._numbers(sequence, payload, module), start=first):
                 self.state.patch_counters[:, counter] += found
 
     def _numbers(self, sequence: SequenceNumber, payload: Bytes, module: Indices) -> tuple[Indices, Indices, Indices]:

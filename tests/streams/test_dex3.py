@@ -22,7 +22,7 @@ from skinware.errors import ConfigurationError
 from skinware.status import BusState, Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import make_bus
-from skinware_drivers.streams import dds
+from skinware_drivers.streams import bus as stream_bus
 from skinware_drivers.streams.dds import DdsBus, record, samples
 from skinware_drivers.streams.dex3 import Dex3Driver, Dex3Options
 from skinware_drivers.testing.driving import emulated_skin
@@ -265,7 +265,7 @@ def test_wrong_names(name: str) -> None:
 
 
 def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dds, "find_spec", lambda _name: None)
+    monkeypatch.setattr(stream_bus, "find_spec", lambda _name: None)
     with pytest.raises(ConfigurationError, match=r"pip install 'skinware\[ros2\]'"):
         make_bus("dds://0")
 

@@ -9,6 +9,7 @@ import pytest
 
 from skinware import Column, Namespace, ServiceReader, ServiceWriter, Structure
 from skinware.errors import BadServiceFile, ConfigurationError, NameInUse, StructureChanged, StructureError
+from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE, TEMPERATURE
 from skinware.tactile.contacts import BEYOND, COLUMNS, MOST, NO_CONTACT, Contacts, ContactSet
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
@@ -175,3 +176,37 @@ def test_a_second_writer_and_wrong_arrays_are_refused(namespace: Namespace) -> N
         ContactsWriter(structure(), "shear_x", namespace=namespace)
     with pytest.raises(ConfigurationError, match="neighbours of 400 taxels"):
         ContactsWriter(structure(), neighbours=np.zeros((3, 1), int), namespace=namespace)
+
+
+def test_the_contact_on_a_region_is_there_at_once(namespace: Namespace) -> None:
+    two = pressed(FLAT, [[0.02, 0.02, 0], [0.1, 0.08, 0]], 3 * PITCH_M, load=1000.0)
+    first = np.where(FLAT[:, 0] < 0.06, two, 0)  # the one near the corner alone
+    corner, rest = np.flatnonzero(FLAT[:, 0] < 0.06), np.flatnonzero(FLAT[:, 0] >= 0.06)
+    with (
+        ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace, slots=8) as writer,
+        ContactsReader(namespace=namespace) as contacts,
+    ):
+        assert contacts.on(corner) is None
+        start_ns = now_ns()
+        writer.publish(two, two > 0, start_ns - 60_000_000)
+        writer.publish(first, first > 0, start_ns)
+        found = contacts.on(corner, above=1.0)
+        assert found is not None
+        assert np.isin(found.taxels, corner).all()
+        assert contacts.on(corner.reshape(-1, 1), above=1e9) is None
+        assert contacts.on(rest) is None  # not any more
+        earlier = contacts.on(rest, within_s=600)
+        assert earlier is not None
+        assert np.isin(earlier.taxels, rest).all()
+        assert contacts.on(slice(0, 400)).id == found.id  # type: ignore[union-attr]
+
+
+def test_an_old_contact_is_not_within_a_short_time(namespace: Namespace) -> None:
+    value = pressed(FLAT, [[0.02, 0.02, 0]], 3 * PITCH_M, load=1000.0)
+    with (
+        ContactsWriter(structure(), tracking=AT_ONCE, namespace=namespace) as writer,
+        ContactsReader(namespace=namespace) as contacts,
+    ):
+        writer.publish(value, value > 0, now_ns() - 10**9)
+        assert contacts.on(slice(None)) is not None
+        assert contacts.on(slice(None), within_s=0.5) is None

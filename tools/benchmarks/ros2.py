@@ -135,7 +135,7 @@ def measure(sensors: int, seconds: float) -> None:
 
 def ways(sensors: int, writes: int = 20) -> None:
     """A point cloud given to Cyclone DDS in both ways, in turns."""
-    from skinware.ros2 import dds
+    from skinware.ros2 import cyclone, dds
 
     domain = alone()
     with ExitStack() as stack:
@@ -154,14 +154,14 @@ def ways(sensors: int, writes: int = 20) -> None:
             publisher.publish(cloud.data)
         answer(pipe, PATIENCE_S)
         pipe.send("go")
-        write_bytes = dds._write_bytes
+        write_bytes = cyclone.write_bytes
         taken_s: dict[bool, list[float]] = {True: [], False: []}
         for _ in range(writes):
             for is_bytes, of_way in taken_s.items():
-                dds._write_bytes = write_bytes if is_bytes else None
+                cyclone.write_bytes = write_bytes if is_bytes else None
                 time.sleep(PAUSE_S)
                 of_way.append(_median_s(lambda: publisher.publish(cloud.data), 1))
-        dds._write_bytes = write_bytes
+        cyclone.write_bytes = write_bytes
         pipe.send("enough")
         answer(pipe, PATIENCE_S)
         node.close()

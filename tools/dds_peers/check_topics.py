@@ -13,8 +13,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from check_fastdds import Peer
 
 from skinware.driver_snapshot import DriverSnapshot
+from skinware.ros_types import dds_name
 from skinware.status import Status
-from skinware_drivers.streams.dds import DdsTopic
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from tests.streams.ros2_peer import CASES, Case, same, serialized
@@ -30,7 +30,7 @@ def is_fresh(frame: DriverSnapshot) -> bool:
 def check(peer: Peer, domain: int, number: int, case: Case) -> bool:
     """Return whether all values of a message are read as they were published."""
     topic = f"rt/case{number}"
-    peer.send(topic, DdsTopic(topic, case.type_name, {}).dds_type, serialized(case.sample(NUMBER)), TIMES)
+    peer.send(topic, dds_name(case.type_name), serialized(case.sample(NUMBER)), TIMES)
     options = {"topic": (f"/case{number}",), "learn_s": 0.1}
     with emulated_skin("ros2", bus=f"dds://{domain}", driver_options=options) as skin:
         frame = read_until(skin.reader, is_fresh)

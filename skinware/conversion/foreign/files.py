@@ -20,6 +20,7 @@ from skinware.conversion.tables import package, pyarrow
 from skinware.errors import ConfigurationError
 
 _BATCH_ROWS = 4096
+_TEXTS = ("string", "large_string")
 _EPISODE_GAP_S = 1.0
 """Time between the last row of an episode and the first of the next."""
 TIME = "time_s"
@@ -45,25 +46,30 @@ class NpzSource:
         self.frames: Mapping[str, str] = {}
         try:
             self._zip = zipfile.ZipFile(path)
-            found = {name.removesuffix(".npy"): self._head(name) for name in self._zip.namelist()}
+            self._arrays = {name.removesuffix(".npy"): self._head(name) for name in self._zip.namelist()}
         except (zipfile.BadZipFile, ValueError, EOFError, SyntaxError) as error:
             raise ConfigurationError(f"{path}: not an NPZ file, or damaged ({error})") from None
-        self._arrays = {
-            name: each for name, each in found.items() if each.dtype.kind in "iufbM" and each.shape and all(each.shape)
+        found = {
+            name: each
+            for name, each in self._arrays.items()
+            if each.dtype.kind in "iufbM" and each.shape and all(each.shape)
         }
         self.left_out: Mapping[str, str] = {
-            name: f"{each.dtype} of shape {each.shape}" for name, each in found.items() if name not in self._arrays
+            name: f"{each.dtype} of shape {each.shape}" for name, each in self._arrays.items() if name not in found
         }
-        lengths = dict.fromkeys(each.shape[0] for each in self._arrays.values())
+        lengths = dict.fromkeys(each.shape[0] for each in found.values())
         self._table_of = {length: f"{length} rows" if len(lengths) > 1 else "" for length in lengths}
         self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {
-            table: {name: each.shape[1:] for name, each in self._arrays.items() if each.shape[0] == length}
+            table: {name: each.shape[1:] for name, each in found.items() if each.shape[0] == length}
             for length, table in self._table_of.items()
         }
 
     def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:  # noqa: ARG002, the names are enough
         arrays = {name: self._arrays[name] for name in names}
         length = next((each.shape[0] for each in arrays.values()), 0)
+        for name, each in arrays.items():
+            if each.dtype.hasobject or each.shape[:1] != (length,):
+                raise ConfigurationError(f"{self.path}: {name} is not numbers or texts of {length} rows: leave it out")
         count = max(
             1, BLOCK_BYTES // max(1, sum(prod(each.shape[1:]) * each.dtype.itemsize for each in arrays.values()))
         )
@@ -139,7 +145,9 @@ class ParquetSource:
         shapes: dict[str, tuple[int, ...]] = {}
         for batch, name in product(batches, kinds):
             with contextlib.suppress(ConfigurationError):
-                shapes[name] = self._array(self._paths[0], name, batch.column(name)).shape[1:]
+                found = self._array(self._paths[0], name, batch.column(name))
+                if found.dtype.kind != "U":
+                    shapes[name] = found.shape[1:]
         self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {"": shapes}
         self.left_out: Mapping[str, str] = {name: kind for name, kind in kinds.items() if name not in shapes}
 
@@ -173,12 +181,14 @@ class ParquetSource:
         while hasattr(column.type, "value_field"):
             sizes = set(package("pyarrow.compute", "Parquet").list_value_length(column).to_pylist())
             if len(sizes) != 1 or None in sizes:
-                raise ConfigurationError(f"{path}: {name} has rows of different lengths: leave it out of the map")
+                raise ConfigurationError(f"{path}: {name} has rows of different lengths: leave it out")
             shape, column = [*shape, *sizes], column.flatten()
-        numbers = column.to_numpy(zero_copy_only=False)
-        if numbers.dtype.kind not in "iufbM":
-            raise ConfigurationError(f"{path}: {name} is not numbers: leave it out of the map")
-        return _plain(numbers.reshape(shape))
+        found = column.to_numpy(zero_copy_only=False)
+        if str(column.type) in _TEXTS and not column.null_count:
+            found = found.astype(str)
+        if found.dtype.kind not in "iufbMU":
+            raise ConfigurationError(f"{path}: {name} is not numbers: leave it out")
+        return _plain(found.reshape(shape))
 
 
 class DatasetSource(ParquetSource):

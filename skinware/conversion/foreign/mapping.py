@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -41,6 +42,7 @@ from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-columns", 1
 UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+_MOST_PLACES = 1 << 20
 _LENGTHS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _INDEX = re.compile(r"(.+)\[([-\d:, ]+)\]")
@@ -204,17 +206,8 @@ def _structure(driver: DriverMap, picks: list[list[Pick]], source: ColumnSource)
         places = _positions(each, driver.table, source, count)
         positions.append(places)
         frames += [(each.frame or source.frames.get(driver.table, "")) * bool(np.isfinite(places).all())] * count
-    known = np.concatenate(positions)
-    nowhere, uid = np.full(len(known), np.nan), np.array(uids, np.uint64)
-    geometry = Geometry(
-        type_name=np.array(names, object),
-        uid=uid,
-        frame=np.array(frames, object),
-        position_m=known,
-        normal=np.full_like(known, np.nan),
-        radius_m=nowhere,
-        confidence=nowhere,
-    )
+    known, uid = np.concatenate(positions), np.array(uids, np.uint64)
+    geometry = replace(Geometry.unknown(names, uid), frame=np.array(frames, object), position_m=known)
     return Structure(
         types=types.values(),
         buses=[source.path.name],
@@ -259,8 +252,8 @@ def _positions(each: ModuleMap, table: str, source: ColumnSource, count: int) ->
 def _place_column(source: ColumnSource, table: str, name: str) -> npt.NDArray[np.float64]:
     """Return the first row of a column of the table, or the whole of one of another table."""
     if name in source.tables[table]:
-        return whole(source, table, name, 1)[:1].astype(np.float64)
+        return whole(source, table, [name], 1)[name][:1].astype(np.float64)
     for other, columns in source.tables.items():
         if name in columns:
-            return whole(source, other, name).astype(np.float64)
+            return whole(source, other, [name], _MOST_PLACES)[name].astype(np.float64)
     raise StructureError(_no_column(name, source, table))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,7 +21,7 @@ class ColumnSource(Protocol):
     Attributes:
         tables: columns by the name of their table: the shape of a row, () for one number. All columns of a table have
             equally many rows. The only table of a file has an empty name.
-        left_out: by name, why something in it is no column of numbers.
+        left_out: by name, why something in it is no column of numbers; a column of texts can be read all the same.
         frames: by table, the name of the coordinate frame of its positions, where the source has one.
         share: part of the last pass over a table that is done, 0 to 1.
     """
@@ -44,15 +44,17 @@ class ColumnSource(Protocol):
         """Close the files. Idempotent."""
 
 
-def whole(source: ColumnSource, table: str, name: str, most: int = 1 << 20) -> npt.NDArray[Any]:
-    """Return a column, (n, ...), or as many of its first rows as there are in ``most`` numbers."""
-    parts, count = [], 0
-    for rows in source.blocks(table, [name]):
-        parts.append(rows[name])
-        count += rows[name].size
-        if count >= most:
+def whole(source: ColumnSource, table: str, names: Sequence[str], most: int | None = None) -> Rows:
+    """Return columns, (n, ...), or as many of their first rows as there are in ``most`` numbers of one of them."""
+    parts: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in names}
+    count = 0
+    for rows in source.blocks(table, names):
+        for name, found in parts.items():
+            found.append(rows[name])
+        count += max(each.size for each in rows.values())
+        if most is not None and count >= most:
             break
-    return np.concatenate(parts) if parts else np.zeros((0, *source.tables[table][name]))
+    return {name: np.concatenate(found) if found else np.zeros(0) for name, found in parts.items()}
 
 
 def first_rows(source: ColumnSource, table: str) -> Rows:

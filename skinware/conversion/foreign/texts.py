@@ -81,7 +81,7 @@ class TextSource:
                 at += sum(map(len, read))
                 self.share = at / size
                 rows = self._rows(lines, number, names)
-                yield {name: each.reshape(-1, *self.tables[table][name]) for name, each in rows}
+                yield {name: each.reshape(-1, *self.tables[table].get(name, ())) for name, each in rows}
                 number += len(read)
 
     def close(self) -> None:
@@ -120,7 +120,8 @@ class TextSource:
 
     def _rows(self, lines: list[str], first: int, names: Collection[str]) -> Iterator[tuple[str, npt.NDArray[Any]]]:
         whole = [name for name in names if name in self._exact | self._dates]
-        floats = [name for name in names if name not in whole]
+        texts = [name for name in names if name in self.left_out]
+        floats = [name for name in names if name not in (*whole, *texts)]
         places = [self._places[name] for name in floats]
         numbers = self._numbers(lines, first, [place for each in places for place in each])
         ends = np.cumsum([len(each) for each in places]).tolist()
@@ -128,6 +129,9 @@ class TextSource:
             yield name, numbers[:, end - len(each) : end]
         for name in whole:
             yield name, self._whole_numbers(lines, first, name)
+        for name in texts:
+            (place,) = self._places[name]
+            yield name, np.array([cells[place] for _, cells in self._split(lines, first)], str)
 
     def _numbers(self, lines: list[str], first: int, places: list[int]) -> npt.NDArray[np.float64]:
         """Return (m, len(places)) float64."""

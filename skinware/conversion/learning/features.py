@@ -62,9 +62,7 @@ class SkinFeatures:
         self._limits_ns = structure.group_age_limits_ns(period_ns)
         self._prefix = "observation.tactile." + service.replace("/", "_")
         self._types = {
-            each.name: np.arange(structure.n_sensors)[structure.index(each.name)]
-            for each in structure.types
-            if len(structure.module_of(each.name))
+            each.name: structure.index(each.name) for each in structure.types if len(structure.module_of(each.name))
         }
         self._names = sensor_names
 

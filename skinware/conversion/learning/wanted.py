@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
-import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,7 +13,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.tables import TableSource, pyarrow
+from skinware.conversion.foreign import open_source
+from skinware.conversion.foreign.source import Rows, whole
+from skinware.conversion.tables import TableSource
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.text import nearest_name
@@ -161,8 +163,6 @@ the recording began."""
 _OF_ONE_RECORDING = ("monotonic_ns", "time_s")
 _VIDEOS = (".mp4", ".mkv", ".avi", ".webm", ".mov")
 
-Columns = Mapping[str, npt.NDArray[Any]]
-
 
 class Joined:
     """Data for a feature: rows of numbers, or paths of images, each with its time.
@@ -178,23 +178,21 @@ class Joined:
 
     def __init__(self, join: Join) -> None:
         self.name, self.path = join.feature, join.path
-        columns = _read(join.path)
-        found = [name for name in TIMES if name in columns]
-        if len(found) != 1:
-            raise ConfigurationError(f"{self.path}: one column must have the time, as one of: {', '.join(TIMES)}")
-        self._time = found[0]
-        self._times = columns[self._time]
-        if self._times.dtype.kind not in "iuf" or not np.isfinite(self._times.astype(np.float64)).all():
+        with contextlib.closing(open_source(join.path)) as source:
+            timed = [(table, name) for table, names in source.tables.items() for name in TIMES if name in names]
+            if len(timed) != 1:
+                raise ConfigurationError(f"{self.path}: one column must have the time, as one of: {', '.join(TIMES)}")
+            [(table, self._time)] = timed
+            known = [*source.tables[table], *source.left_out]
+            chosen = join.columns or tuple(name for name in known if name != self._time)
+            for name in chosen:
+                if name not in known:
+                    raise ConfigurationError(f"{self.path}: no column {name!r}{nearest_name(name, known)}")
+            columns = whole(source, table, [self._time, *chosen])
+        self._times = columns.pop(self._time).ravel()
+        if not np.isfinite(self._times.astype(np.float64)).all():
             raise ConfigurationError(f"{self.path}: {self._time} is not numbers")
-        if not len(self._times):
-            raise ConfigurationError(f"{self.path}: no rows in it")
-        chosen = join.columns or tuple(name for name in columns if name not in TIMES)
-        for name in chosen:
-            if name not in columns:
-                raise ConfigurationError(f"{self.path}: no column {name!r}{nearest_name(name, columns)}")
-        self.names, self.rows = self._joined({name: columns[name] for name in chosen})
-        if len(self.rows) != len(self._times):
-            raise ConfigurationError(f"{self.path}: {len(self.rows)} rows with {len(self._times)} times")
+        self.names, self.rows = self._joined(columns)
         backward = np.flatnonzero(np.diff(self._times) < 0)
         if len(backward):
             raise ConfigurationError(f"{self.path}: time goes back after row {backward[0] + 1}")
@@ -239,7 +237,7 @@ class Joined:
         on_axis: npt.NDArray[np.int64] = wall_ns + (axis - wall)[at]
         return on_axis
 
-    def _joined(self, columns: Columns) -> tuple[list[str], npt.NDArray[Any]]:
+    def _joined(self, columns: Rows) -> tuple[list[str], npt.NDArray[Any]]:
         if len(columns) == 1:
             (only,) = columns.values()
             if only.ndim == 1 and only.dtype.kind in "UO":
@@ -255,8 +253,8 @@ class Joined:
                 raise ConfigurationError(f"{self.path}: {name} is not a finite number in row {row + 1}")
             names += [name] if column.ndim == 1 else [f"{name}[{number}]" for number in range(rows.shape[1])]
             parts.append(rows)
-        if not names or len({len(part) for part in parts}) > 1:
-            raise ConfigurationError(f"{self.path}: no columns of numbers, or columns of different lengths")
+        if not names:
+            raise ConfigurationError(f"{self.path}: no columns of numbers")
         return names, np.concatenate(parts, axis=1)
 
     def _image(self, text: str) -> str:
@@ -286,63 +284,3 @@ def matched(
         found = np.where(is_nearer, after, before)
     is_near = (found >= 0) & (np.abs(at_ns - times_ns[np.maximum(found, 0)]) <= limit_ns)
     return np.where(is_near, found, -1)
-
-
-def _read(path: Path) -> Columns:
-    readers: dict[str, Callable[[Path], Columns]] = {".csv": _csv, ".parquet": _parquet, ".npz": _npz}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise ConfigurationError(f"{path}: join a file that ends in .csv, .parquet or .npz")
-    return reader(path)
-
-
-def _csv(path: Path) -> Columns:
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        reader = csv.reader(stream)
-        head = next(reader, [])
-        rows = []
-        for row in reader:
-            if len(row) != len(head):
-                raise ConfigurationError(f"{path}, line {reader.line_num}: {len(row)} columns instead of {len(head)}")
-            rows.append(row)
-    return {name: _numbers([row[number] for row in rows]) for number, name in enumerate(head)}
-
-
-def _numbers(texts: list[str]) -> npt.NDArray[Any]:
-    """Return texts as int64, as float64, or else as texts."""
-    for convert in (int, float):
-        try:
-            return np.array([convert(text) for text in texts], np.int64 if convert is int else np.float64)
-        except (ValueError, OverflowError):
-            continue
-    return np.array(texts)
-
-
-def _parquet(path: Path) -> Columns:
-    arrow = pyarrow()
-    try:
-        with path.open("rb") as stream:  # given a path, pyarrow may close it later
-            table = arrow.parquet.read_table(stream)
-    except arrow.ArrowException as error:
-        raise ConfigurationError(f"{path}: not Parquet, or damaged ({str(error).splitlines()[0]})") from None
-    columns = {}
-    for name in table.column_names:
-        column = table.column(name).combine_chunks()
-        if arrow.types.is_list(column.type) or arrow.types.is_fixed_size_list(column.type):
-            rows = column.to_pylist()
-            if any(row is None or len(row) != len(rows[0] or ()) for row in rows):
-                raise ConfigurationError(f"{path}: {name} has rows of different lengths")
-            columns[name] = np.array(rows)
-        elif column.null_count:
-            raise ConfigurationError(f"{path}: {name} is missing in some rows")
-        else:
-            columns[name] = column.to_numpy(zero_copy_only=False)
-    return columns
-
-
-def _npz(path: Path) -> Columns:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return dict(arrays)
-    except (zipfile.BadZipFile, ValueError, EOFError, TypeError) as error:
-        raise ConfigurationError(f"{path}: not an NPZ file, or damaged ({error})") from None

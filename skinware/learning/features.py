@@ -1,0 +1,90 @@
+"""Features of touch for learning: contacts as rows of numbers, spectrograms, and how likely something slips."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from skinware.errors import ConfigurationError
+from skinware.tactile.contacts import ContactSet
+from skinware.tactile.contacts_service import ContactsSample
+
+CONTACT_NUMBERS = ("load", "peak", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "age_s")
+"""Names of the columns of :func:`contact_numbers`."""
+
+
+def contact_numbers(contacts: ContactSet | ContactsSample | None, count: int) -> npt.NDArray[np.float32]:
+    """Return (count, 9) float32: the contacts with the largest loads as rows, for a policy that wants a fixed shape.
+
+    Columns: :data:`CONTACT_NUMBERS`. Rows beyond the contacts there are, and numbers that are not known, are 0.
+
+    Args:
+        contacts: of one moment; None: none.
+        count: number of rows.
+    """
+    rows = np.zeros((count, len(CONTACT_NUMBERS)), np.float32)
+    if contacts is None:
+        return rows
+    found = contacts.contacts if isinstance(contacts, ContactsSample) else contacts
+    chosen = np.argsort(-found.load, kind="stable")[:count]
+    columns = (found.load, found.peak, found.cop_m, found.normal, found.age_s)
+    numbers = np.column_stack([column[chosen] for column in columns])
+    rows[: len(chosen)] = np.nan_to_num(numbers)
+    return rows
+
+
+def spectrogram(
+    values: npt.NDArray[Any], rate_hz: float, bands_hz: npt.ArrayLike = (5.0, 20.0, 40.0, 80.0, 160.0)
+) -> npt.NDArray[np.float32]:
+    """Return (bands, n) float32: how strongly each value vibrates in each band of frequencies, in its unit.
+
+    It is the root mean square of the part of each value in a band, after its mean and slope are taken away. A band
+    above half the rate is 0.
+
+    Args:
+        values: (samples, n) at a fixed rate, the oldest first.
+        rate_hz: samples a second.
+        bands_hz: (bands + 1,) limits of the bands, ascending.
+
+    Raises:
+        ConfigurationError: fewer than 4 samples, or limits that do not ascend.
+    """
+    limits = np.asarray(bands_hz, np.float64)
+    if len(values) < 4 or limits.ndim != 1 or len(limits) < 2 or (np.diff(limits) <= 0).any():
+        raise ConfigurationError("a spectrogram needs 4 samples and limits of bands in ascending order")
+    samples = len(values)
+    time = np.linspace(-1.0, 1.0, samples)
+    flat = np.asarray(values, np.float64) - np.mean(values, axis=0)
+    flat -= np.outer(time, time @ flat / (time @ time))
+    window = np.hanning(samples)
+    power = np.abs(np.fft.rfft(flat * window[:, np.newaxis], axis=0)) ** 2
+    power[1 : None if samples % 2 else -1] *= 2  # the other half of the spectrum is its mirror
+    power /= samples * (window @ window)
+    frequency = np.fft.rfftfreq(samples, 1 / rate_hz)
+    bands = [power[(frequency >= low) & (frequency < high)].sum(axis=0) for low, high in pairwise(limits)]
+    found: npt.NDArray[np.float32] = np.sqrt(np.array(bands)).astype(np.float32)
+    return found
+
+
+def slip(values: npt.NDArray[Any], rate_hz: float, quiet: npt.ArrayLike = 1.0) -> npt.NDArray[np.float32]:
+    """Return (n,) float32 in 0 to 1: how much of each value's change is vibration, as of something that slips.
+
+    0: at rest, or pressed ever more; towards 1: it vibrates above 20 Hz more than it changes slowly. It is a feature
+    to learn from, not a detector: an impact vibrates as well.
+
+    Args:
+        values: (samples, n), at least 0.1 s at 100 Hz or more, the oldest first.
+        rate_hz: samples a second.
+        quiet: (n,) or one number: noise of each value at rest, in its unit; weaker vibration counts as none.
+
+    Raises:
+        ConfigurationError: as :func:`spectrogram`.
+    """
+    slow, fast = spectrogram(values, rate_hz, (1.0, 20.0, max(40.0, rate_hz / 2 + 1)))
+    trend = np.abs(np.asarray(values[-1], np.float64) - values[0])
+    above = np.maximum(fast - np.asarray(quiet, np.float64), 0.0)
+    found: npt.NDArray[np.float32] = (above / (above + slow + trend + np.asarray(quiet))).astype(np.float32)
+    return found

@@ -1,0 +1,178 @@
+"""Read topics of ROS 2 that rmw_zenoh carries as a bus: without ROS, and without publishing.
+
+Keys, tokens and attachments: ros2/rmw_zenoh, commit bfc065f, ``docs/design.md``. Messages of a topic have the key
+``DOMAIN/TOPIC/TYPE/HASH``. A publisher shows a token, from which the identity in its attachments is computed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections import deque
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from typing import Annotated, ClassVar
+
+import msgspec
+from msgspec import Meta
+
+from skinware.errors import BridgeError, BusNotAvailable, ConfigurationError, MissingExtra
+from skinware.realtime import now_ns
+from skinware_drivers.bus import Bus
+from skinware_drivers.streams.dds import LONGEST, DdsTopic, TopicBus, TopicPort, TopicSource, parse_domain, record
+
+if find_spec("zenoh") is None or find_spec("xxhash") is None:
+    raise MissingExtra("a bus ros2:// needs packages that are not installed: pip install 'skinware[ros2-zenoh]'")
+
+from skinware.bridge.link import Link
+from skinware.ros2.rmw_zenoh import ROUTER, MessageAttachment, gid, graph_endpoints
+
+_TOKEN_PARTS = 13
+_AT_ONCE = 64
+"""Samples in one read."""
+
+
+class ZenohOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    router: Annotated[tuple[str, ...], Meta(description="routers of zenoh, as tcp/192.168.1.10:7447")] = (ROUTER,)
+    depth: Annotated[
+        int, Meta(ge=1, le=65536, description="samples that wait to be read; further ones are dropped")
+    ] = 1024
+
+
+def _no_device_end(channel: str, *_: object, **_more: object) -> Bus:
+    raise ConfigurationError(f"bus ros2://{channel}: is only read: emulated devices publish on dds://{channel}")
+
+
+class ZenohTopicBus(TopicBus):
+    """Topics of ROS 2 over rmw_zenoh. Its name is ``ros2://DOMAIN?key=value``, with the number of the domain.
+
+    It joins the graph as a session without a node. Samples that a publisher numbered and that did not come are counted
+    as dropped.
+
+    Raises:
+        ConfigurationError: no such domain, or an option is unknown or has a bad value.
+    """
+
+    scheme: ClassVar[str] = "ros2"
+    device_end: ClassVar[Callable[..., Bus] | None] = _no_device_end
+    options_class: ClassVar[type[msgspec.Struct]] = ZenohOptions
+
+    def __init__(
+        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+    ) -> None:
+        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
+        self.domain: int = parse_domain(channel, self.scheme)
+
+    def _join(self, topics: Sequence[DdsTopic]) -> TopicPort:
+        return ZenohPort(self.name, self.domain, self._options, topics)
+
+
+def publisher_of(token: str) -> tuple[str, str]:
+    """Return topic and type in DDS of the publisher with a token.
+
+    Raises:
+        ValueError: it is no token of a publisher.
+    """
+    parts = token.split("/")
+    if len(parts) != _TOKEN_PARTS or parts[5] != "MP":
+        raise ValueError(f"{token!r} is no token of a publisher")
+    return parts[9].replace("%", "/"), parts[10]
+
+
+class ZenohPort(TopicPort):
+    """A session of zenoh that reads topics.
+
+    Args:
+        name: of the bus, for messages.
+
+    Raises:
+        BusNotAvailable: there can be no session.
+        ConfigurationError: a router is malformed.
+    """
+
+    def __init__(self, name: str, domain: int, options: ZenohOptions, topics: Sequence[DdsTopic]) -> None:
+        super().__init__(topics)
+        self._domain, self._depth = domain, options.depth
+        self._samples: deque[tuple[str, bytes, bytes]] = deque()
+        self._tokens: deque[tuple[str, bool]] = deque()
+        self._sequences: dict[str, tuple[bytes, int]] = {}
+        self._ends: list[Callable[[], None]] = []
+        self._event = -1
+        try:
+            self._link = Link(graph_endpoints(options.router))
+        except BridgeError as error:
+            raise BusNotAvailable(f"{name}: {error}") from None
+        self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._link.watch_tokens(f"@ros2_lv/{domain}/*/*/*/MP/**", self._token)
+        self.change(topics)
+
+    def fileno(self) -> int:
+        return self._event
+
+    def change(self, topics: Sequence[DdsTopic]) -> None:
+        """Read these topics alone."""
+        self.topics = topics
+        for end in self._ends:
+            end()
+        names = dict.fromkeys(topic.name.removeprefix("rt/") for topic in topics)
+        self._ends = [self._link.listen_attached(f"{self._domain}/{name}/*/*", self._sample) for name in names]
+
+    def look(self, time_ns: int) -> bool:
+        has_changed = bool(self._tokens)
+        while self._tokens:
+            token, is_there = self._tokens.popleft()
+            with contextlib.suppress(ValueError):
+                topic, type_name = publisher_of(token)
+                if is_there:
+                    self.came(TopicSource(gid(token), f"rt{topic}", type_name, time_ns))
+                else:
+                    self.went(gid(token))
+        return has_changed
+
+    def read(self, size: int) -> bytes:  # noqa: ARG002
+        """Return records of samples that have come, at most a few."""
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._event)
+        time_ns = now_ns()
+        self.look(time_ns)
+        numbers = {(topic.name, topic.dds_type): topic.number for topic in reversed(self.topics)}
+        records = []
+        for _ in range(min(len(self._samples), _AT_ONCE)):
+            key, attached, sample = self._samples.popleft()
+            _, *topic, type_name, _ = key.split("/")
+            number = numbers.get((name := "/".join(["rt", *topic]), type_name))
+            try:
+                attachment = MessageAttachment.of(attached)
+            except ValueError:
+                number = None
+            if number is None or len(sample) > LONGEST:
+                self.refused += 1
+            elif self.is_read(name, number, attachment.gid, time_ns):
+                publisher, before = self._sequences.get(name, (b"", 0))
+                if publisher == attachment.gid:
+                    self.dropped += max(0, attachment.sequence - before - 1)
+                self._sequences[name] = attachment.gid, attachment.sequence
+                records.append(record(number, attachment.time_ns, sample))
+        if self._samples:
+            self._wake()
+        return b"".join(records)
+
+    def close(self) -> None:
+        if self._event >= 0:
+            self._link.close()
+            os.close(self._event)
+            self._event = -1
+
+    def _sample(self, key: str, attachment: bytes, payload: bytes) -> None:
+        """Keep a sample; called in threads of zenoh."""
+        if len(self._samples) < self._depth:  # its number shows later that it is missing
+            self._samples.append((key, attachment, payload))
+            self._wake()
+
+    def _token(self, token: str, is_there: bool) -> None:
+        self._tokens.append((token, is_there))
+        self._wake()
+
+    def _wake(self) -> None:
+        if self._event >= 0:
+            os.eventfd_write(self._event, 1)

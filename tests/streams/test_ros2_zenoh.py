@@ -1,0 +1,197 @@
+"""Topics of ROS 2 over zenoh as a skin: from our own node, from zenoh-ros2-sdk, and from nobody who can be read."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skinware import DriverSnapshot, Namespace
+from skinware.errors import ConfigurationError
+from skinware.ros2.rmw_zenoh import MessageAttachment, ZenohNode
+from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
+from skinware.status import Status
+from skinware_drivers.registry import make_bus
+from skinware_drivers.streams.dds import DdsTopic
+from skinware_drivers.streams.ros2 import Ros2Driver, Ros2Options
+from skinware_drivers.streams.ros2_presets import TEXTS
+from skinware_drivers.streams.ros2_zenoh import ZenohPort, ZenohTopicBus, publisher_of
+from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.testing.waiting import read_until, wait_until
+from tests.commands import run
+from tests.ros2.router import Router, router, sockets
+from tests.ros2.sdk_peer import sdk_peer
+from tests.streams.ros2_peer import CASES, Case, same, serialized
+
+HASH = f"RIHS01_{0:064x}"
+TIMED = Qos(depth=10)
+
+
+@pytest.fixture(scope="module")
+def at() -> Iterator[Router]:
+    """A router. Zenoh's threads have descriptors of their own, which stay from now on."""
+    with router() as one:
+        with joined(one, 0, _topics("/warm")) as port, published(one, case_of("std_msgs/msg/UInt16"), "/warm"):
+            wait_until(lambda: bool(port.read(0)))
+        yield one
+
+
+@pytest.fixture(autouse=True)
+def _sessions_end(at: Router, namespace: Namespace) -> Iterator[None]:
+    """Before anybody looks for leaks, all sockets and threads of the test's sessions are gone."""
+    before, threads = sockets(), set(threading.enumerate())
+    yield
+    wait_until(lambda: sockets() <= before and set(threading.enumerate()) <= threads)
+
+
+@contextmanager
+def joined(at: Router, domain: int, topics: Sequence[DdsTopic], more: str = "") -> Iterator[ZenohPort]:
+    bus = make_bus(f"ros2://{domain}?router={at.endpoint}{more}")
+    assert isinstance(bus, ZenohTopicBus)
+    bus.topics = topics
+    bus.open()
+    try:
+        assert isinstance(bus._joined, ZenohPort)
+        yield bus._joined
+    finally:
+        bus.close()
+
+
+def _topics(name: str) -> Sequence[DdsTopic]:
+    return Ros2Driver(Ros2Options(topic=(name,))).topics
+
+
+@contextmanager
+def published(at: Router, case: Case, topic: str = "/touch", domain: int = 0, **identity: Any) -> Iterator[list[int]]:
+    """A node that publishes samples of rising numbers every 10 ms; yields the newest number."""
+    node = ZenohNode(NodeIdentity("talker", domain=domain, **identity), connect=[at.endpoint])
+    over, newest = threading.Event(), [0]
+    publisher = node.publisher(topic, MessageType(case.type_name, HASH), TIMED)
+
+    def talk() -> None:
+        while not over.wait(0.01):
+            publisher.publish(serialized(case.sample(newest[0])))
+            newest[0] += 1
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        yield newest
+    finally:
+        over.set()
+        thread.join()
+        node.close()
+
+
+def driven(at: Router, domain: int, **options: Any) -> Any:
+    bus = f"ros2://{domain}?router={at.endpoint}"
+    return emulated_skin("ros2", bus=bus, driver_options={"learn_s": 0.2, **options})
+
+
+def case_of(type_name: str) -> Case:
+    return next(case for case in CASES if case.type_name == type_name)
+
+
+def is_whole(frame: DriverSnapshot) -> bool:
+    return not (frame.status & (Status.STALE | Status.NEVER_SEEN)).any()
+
+
+def later_than(last: DriverSnapshot) -> Callable[[DriverSnapshot], bool]:
+    return lambda frame: frame.sequence > last.sequence
+
+
+@pytest.mark.parametrize("distro", list(Distro))
+def test_values_of_our_own_node(at: Router, distro: Distro) -> None:
+    domain = 1 + list(Distro).index(distro)
+    case = case_of("tactile_msgs/msg/TactileState")
+    with published(at, case, "/hand/touch", domain, distro=distro) as newest:
+        with driven(at, domain, topic=("/hand/touch",)) as skin:
+            frame = read_until(skin.reader, is_whole)
+            for _ in range(5):
+                assert any(same(frame.values, case.shown(number)) for number in range(newest[0] + 1))
+                frame = read_until(skin.reader, later_than(frame))
+            [counters] = skin.reader.bus_counters(frame)
+            assert [counters[name] for name in ("dropped", "refused", "bad_length")] == [0, 0, 0]
+
+
+@pytest.mark.thorough
+def test_values_of_zenoh_ros2_sdk(at: Router, tmp_path: Path) -> None:
+    names = ("Float32MultiArray", "MultiArrayLayout", "MultiArrayDimension")
+    texts = {f"std_msgs/msg/{name}": TEXTS[f"std_msgs/{name}"] for name in names}
+    with sdk_peer(at.port, tmp_path, texts) as sdk:
+        key = sdk.ask(ask="publish", topic="/touch", count=7, domain=3)
+        assert key.startswith("3/touch/std_msgs::msg::dds_::Float32MultiArray_/RIHS01_")
+        with driven(at, 3) as skin:
+            first = read_until(skin.reader, is_whole)
+            later = read_until(skin.reader, lambda f: is_whole(f) and f.values[0] >= first.values[0] + 20)
+            for frame in (first, later):
+                assert frame.values.tolist() == [frame.values[0] + n for n in range(7)]
+            [counters] = skin.reader.bus_counters(later)
+            assert [counters[name] for name in ("dropped", "refused", "bad_length")] == [0, 0, 0]
+
+
+def test_publishers_come_and_go_and_others_cannot_be_read(at: Router, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    case = case_of("std_msgs/msg/UInt16")
+    stranger = Case("my_msgs/msg/Hand", case.idl_type, case.sample, case.shown, [])
+    with ExitStack() as first, published(at, stranger, domain=4):
+        first.enter_context(published(at, case, domain=4))
+        with driven(at, 4) as skin:
+            read_until(skin.reader, is_whole)
+            with published(at, case, domain=4):
+                wait_until(lambda: "/touch has 2 publishers: only the first is read" in caplog.text)
+                read_until(skin.reader, lambda f: skin.reader.bus_counters(f)[0]["refused"] > 0)
+            assert "cannot be read: its type is my_msgs::msg::dds_::Hand_, not one of" in caplog.text
+            first.close()
+            wait_until(lambda: caplog.text.count("a publisher of rt/touch is gone") == 2)
+            read_until(skin.reader, lambda f: bool((f.status & Status.STALE).all()))
+            with published(at, case, domain=4):
+                read_until(skin.reader, is_whole)
+
+
+def test_samples_that_are_lost_or_wrong_are_counted(at: Router) -> None:
+    """Sequence numbers with a gap, and samples without a proper attachment, beside a full queue."""
+    [topic] = [one for one in _topics("/touch") if one.dds_type == "std_msgs::msg::dds_::UInt16_"]
+    sample, key = serialized(case_of("std_msgs/msg/UInt16").sample(1)), f"5/touch/{topic.dds_type}/{HASH}"
+    with joined(at, 5, [topic], "&depth=4") as port:
+        for sequence in (1, 2, 5):
+            port._sample(key, MessageAttachment(sequence, 10**18, bytes(16)).packed(), sample)
+        port._sample(key, b"", sample)
+        port._sample(key, MessageAttachment(6, 10**18, bytes(16)).packed(), sample)  # finds no room
+        assert port.read(0).count(sample) == 3
+        assert (port.dropped, port.refused) == (2, 1)
+        port._sample(key, MessageAttachment(7, 10**18, bytes(16)).packed(), sample)
+        port._sample("5/touch/std_msgs::msg::dds_::Int8_/x", MessageAttachment(8, 0, bytes(16)).packed(), sample)
+        assert port.read(0).count(sample) == 1
+        assert (port.dropped, port.refused) == (3, 2)
+
+
+def test_topics_are_found(at: Router) -> None:
+    with published(at, case_of("sensor_msgs/msg/PointCloud2"), "/cloud", 6):
+        bus_name = f"ros2://6?router={at.endpoint}"
+        [bus] = json.loads(run("skin-find", bus_name, "--listen", "3", "--json").stdout)["buses"]
+        [topic] = bus["topics"]
+        assert (topic["topic"], topic["publishers"], topic["drivers"]) == ("rt/cloud", 1, ["ros2"])
+
+
+@pytest.mark.parametrize("name", ["ros2://x", "ros2://300", "ros2://0?router=nowhere", "ros2://0?qos=reliable"])
+def test_names_that_are_wrong(name: str) -> None:
+    with pytest.raises(ConfigurationError):
+        emulated_skin("ros2", bus=name).__enter__()
+
+
+def test_emulated_devices_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="emulated devices publish on dds://0"):
+        make_bus("ros2://0", for_devices=True)
+
+
+@pytest.mark.parametrize("token", ["", "@ros2_lv/0/a/0/1/SS/%/%/n/%t/T/h/::", "@ros2_lv/0/a/0/1/MP/%/%/n/%t"])
+def test_tokens_of_no_publisher(token: str) -> None:
+    with pytest.raises(ValueError, match="no token of a publisher"):
+        publisher_of(token)

@@ -1,0 +1,185 @@
+"""Records an emulated hand with lerobot-record, and compares every row with the recorded frame nearest to its time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import ExitStack
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+import skinware
+import skinware.recording
+from skinware.learning.images import Colours, TouchImage
+from skinware.learning.live import Totals
+
+BIN = Path(sys.executable).parent
+FPS, SECONDS, EPISODES, TIE_NS = 30, 4, 3, 300_000
+"""Two frames that are as near but for TIE_NS are both right: a loop and its robot read the clock at two moments."""
+
+
+def main() -> None:
+    folder = Path(sys.argv[1])
+    os.environ["SKINWARE_NAMESPACE"] = f"lerobot-{os.getpid()}"
+    os.environ["PYTHONPATH"] = f"{Path(__file__).parent}:{os.environ.get('PYTHONPATH', '')}"
+    print(f"lerobot {version('lerobot')}, live")
+    for name, busy in (("quiet", 0), ("busy", 2)):
+        check_rows(folder, name, busy)
+    check_videos(folder)
+    check_death(folder)
+
+
+def start_hand() -> subprocess.Popen[bytes]:
+    hand = subprocess.Popen(
+        [BIN / "skin-driver", "--driver", "inspire", "--bus", "virtual", "--name", "hand"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    with skinware.DriverReader("hand", timeout_s=60) as reader:
+        while not reader.read(timeout_s=60).fresh("pressure").all():
+            time.sleep(0.05)
+    return hand
+
+
+def end(process: subprocess.Popen[bytes], how: signal.Signals = signal.SIGINT) -> None:
+    process.send_signal(how)
+    process.wait(30)
+
+
+def record(
+    folder: Path, name: str, *, episodes: int = EPISODES, video: bool = False, stale: str = "raise", age_ms: int = 300
+) -> list[str]:
+    """The words of lerobot-record."""
+    camera = f"{{type: skinware, driver: hand, height: 48, width: 96, max_age_ms: {age_ms}, when_stale: {stale}}}"
+    return [
+        str(BIN / "lerobot-record"),
+        "--robot.type=skinware",
+        "--robot.discover_packages_path=stand_in",
+        f"--robot.robot={{type: stand_in, log: {folder / name}.times}}",
+        "--robot.driver=hand",
+        "--robot.numbers=taxel",
+        f"--robot.when_stale={stale}",
+        f"--robot.max_age_ms={age_ms}",
+        f"--robot.cameras={{touch: {camera}}}",
+        "--teleop.type=stand_in",
+        f"--dataset.repo_id=skinware/{name}",
+        f"--dataset.root={folder / name}",
+        "--dataset.no_stamp=true",
+        f"--dataset.num_episodes={episodes}",
+        f"--dataset.episode_time_s={SECONDS}",
+        "--dataset.reset_time_s=0",
+        "--dataset.single_task=touch",
+        f"--dataset.video={str(video).lower()}",
+        "--dataset.push_to_hub=false",
+        f"--dataset.fps={FPS}",
+        "--play_sounds=false",
+    ]
+
+
+def check_rows(folder: Path, name: str, busy: int) -> None:
+    with ExitStack() as stack:
+        stack.callback(end, start_hand())
+        for _ in range(busy):
+            stack.callback(end, subprocess.Popen([sys.executable, "-c", "while True: pass"]), signal.SIGKILL)
+        tape = folder / f"{name}.mcap"
+        recorder = subprocess.Popen(
+            [BIN / "skin-record", "-o", tape], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        )
+        done = subprocess.run(record(folder, name, age_ms=10_000), capture_output=True, text=True)
+        end(recorder)
+        assert done.returncode == 0, done.stderr[-3000:]
+    dataset = LeRobotDataset(f"skinware/{name}", root=folder / name)
+    assert dataset.meta.total_episodes == EPISODES
+    state = np.stack([np.asarray(each) for each in dataset.hf_dataset["observation.state"]])
+    names = dataset.meta.features["observation.state"]["names"]
+    with skinware.recording.open(tape) as recording:
+        series = recording["hand"].read()
+        layout = next(iter(recording.snapshots())).layout
+    positions = np.arange(len(layout.module_of("pressure")))
+    totals = Totals(layout, "pressure", positions, "taxel")
+    columns = [names.index(f"touch.{each}") for each in totals.names]
+    values = series.physical("pressure")
+    times_ns = np.loadtxt(f"{folder / name}.times", np.int64)
+    assert len(times_ns) == len(state) == dataset.meta.total_frames, (len(times_ns), len(state))
+    acquired_ns = series.acquired_ns
+    period_ns = series.origin.period_ns
+    image = TouchImage(layout, "pressure", positions, 48, 96, Colours("grey", 0, 4095))
+    ties, offs = 0, []
+    for row, time_ns in enumerate(times_ns.tolist()):
+        distance = np.abs(acquired_ns - time_ns)
+        near = np.flatnonzero(distance <= distance.min() + TIE_NS)
+        found = [frame for frame in near if np.array_equal(values[frame].astype(np.float32), state[row, columns])]
+        assert found, f"{name}, row {row}: not the frame nearest to its time ({distance.min() / 1e6:.2f} ms)"
+        ties += len(near) > 1
+        offs.append(distance.min() / 1e6)
+        picture = (
+            np.rint(np.asarray(dataset[row]["observation.images.touch"]) * 255).astype(np.uint8).transpose(1, 2, 0)
+        )
+        assert any(np.array_equal(picture, image.of(values[frame])) for frame in found), f"{name}, row {row}: its image"
+    within = float(np.mean(np.array(offs) <= period_ns / 2e6))
+    span_s = sum(np.ptp(times_ns[rows_of(dataset, number)]) for number in range(EPISODES)) / 1e9
+    print(
+        f"{name}: {len(state)} rows in {EPISODES} episodes, {(len(state) - EPISODES) / span_s:.1f} a second, each the"
+        f" frame nearest to its time: median {np.median(offs):.2f}, largest {max(offs):.2f} ms away;"
+        f" {within:.1%} within half a period ({period_ns / 2e6:.1f} ms); {ties} ties"
+    )
+
+
+def rows_of(dataset: LeRobotDataset, number: int) -> slice:
+    episode = dataset.meta.episodes[number]
+    return slice(episode["dataset_from_index"], episode["dataset_to_index"])
+
+
+def check_videos(folder: Path) -> None:
+    hand = start_hand()
+    done = subprocess.run(
+        record(folder, "video", episodes=1, video=True, age_ms=10_000), capture_output=True, text=True
+    )
+    end(hand)
+    assert done.returncode == 0, done.stderr[-3000:]
+    dataset = LeRobotDataset("skinware/video", root=folder / "video")
+    assert dataset.meta.features["observation.images.touch"]["dtype"] == "video"
+    assert dataset[5]["observation.images.touch"].shape == (3, 48, 96)
+    print(f"video: {len(dataset)} rows, read back")
+
+
+def check_death(folder: Path) -> None:
+    """A killed driver ends lerobot-record with its error; with hold, a flag is set until the driver returns."""
+    for stale in ("raise", "hold"):
+        hand = start_hand()
+        name = f"death-{stale}"
+        recorder = subprocess.Popen(record(folder, name, episodes=2, stale=stale), stderr=subprocess.PIPE, text=True)
+        times = Path(f"{folder / name}.times")
+        while not times.exists() or times.read_text().count("\n") < 30:
+            assert recorder.poll() is None
+            time.sleep(0.05)
+        end(hand, signal.SIGKILL)
+        if stale == "hold":
+            time.sleep(1)
+            hand = start_hand()
+        _, errors = recorder.communicate(timeout=120)
+        if stale == "raise":
+            assert recorder.returncode != 0
+            assert "TimeoutError" in errors.splitlines()[-1], errors[-2000:]
+            print(f"killed: {errors.splitlines()[-1]}")
+            with skinware.Skin() as skin:
+                assert skin.latest() is None
+            continue
+        end(hand)
+        assert recorder.returncode == 0, errors[-3000:]
+        dataset = LeRobotDataset(f"skinware/{name}", root=folder / name)
+        held = dataset.meta.features["observation.state"]["names"].index("touch.held")
+        flags = np.array([float(each[held]) for each in dataset.hf_dataset["observation.state"]])
+        assert 0 < flags.sum() < len(flags)
+        assert flags[0] == flags[-1] == 0
+        print(f"held: {int(flags.sum())} of {len(flags)} rows while the driver was gone; then it went on")
+
+
+if __name__ == "__main__":
+    main()

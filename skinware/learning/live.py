@@ -354,7 +354,8 @@ def points(layout: SkinLayout, values: npt.NDArray[Any], type_name: str, positio
     geometry = layout.geometry(type_name)
     place = np.nan_to_num(geometry.position_m[positions])
     force = -values[:, np.newaxis] * np.nan_to_num(geometry.normal[positions])
-    return np.concatenate((place, force), axis=1).astype(np.float32)
+    found: npt.NDArray[np.float32] = np.concatenate((place, force), axis=1).astype(np.float32)
+    return found
 
 
 def _slug(text: str) -> str:

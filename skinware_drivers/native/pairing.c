@@ -112,7 +112,7 @@ static int64_t match(struct path *path, const struct cycle *cycle, int64_t m, in
     int64_t n = cycle->n, n_starts = 0, n_candidates = 0, n_out = 0;
     int64_t *starts = path->starts, *late = path->found;
     for (int64_t i = 0; i + n <= m; i++) {
-        if (path->place[i] >= n || !is_cycle(path, cycle, i))
+        if (!is_cycle(path, cycle, i))
             continue;
         if (!can_be_trusted(path, cycle, i) || path->time_ns[i + n - 1] - path->time_ns[i] > cycle->maximum_age_ns)
             late[n_candidates++] = i;

@@ -21,7 +21,7 @@ from tests.specification.both_paths import Pair, hand_clock
 from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000
-PERIOD_NS = 20 * MS
+PERIOD_NS = 20 * MS + 1  # odd: half of it is no whole number
 USUAL_NS = 26 * MS
 """Of a device that is slower than it should be."""
 MODULES = 2
@@ -69,7 +69,7 @@ class Device:
     @property
     def decoder(self) -> SpecifiedDecoder:
         layout, tables = self.skin
-        return SpecifiedDecoder([layout], tables, [0.02])
+        return SpecifiedDecoder([layout], tables, [PERIOD_NS / 1e9])
 
     def wire(self, frame: Sent) -> tuple[int, bytes]:
         """Identifier and payload."""
@@ -79,7 +79,7 @@ class Device:
     def join_in_c(self, sent: Sequence[Sent], cuts: Sequence[int] = ()) -> None:
         """Fail unless C does the same as numpy."""
         layout, tables = self.skin
-        with hand_clock() as clock, Pair(clock, [layout], tables, [0.02]) as pair:
+        with hand_clock() as clock, Pair(clock, [layout], tables, [PERIOD_NS / 1e9]) as pair:
             begin_ns = clock.now_ns
             for begin, end in zip([0, *cuts], [*cuts, len(sent)], strict=True):
                 frames = [(0, begin_ns + frame.time_ns, *self.wire(frame)) for frame in sent[begin:end]]

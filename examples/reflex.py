@@ -1,25 +1,40 @@
-"""Act on a touch within two frames: python reflex.py [NAMESPACE]. Prints each event and the age of its frame."""
+"""Act on a touch within two frames: python reflex.py [NAMESPACE [JOINTS]]. Prints each event and the age of its frame.
+
+JOINTS is the service of the hand's joints, in the default namespace, which stops at the request ``hold``: that of a
+simulated hand (``skin-emulate --world mujoco:gripper``), or one that the program of your hand publishes.
+"""
 
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
+from typing import Any
 
 from skinware.realtime import Profile, now_ns
+from skinware.service import ServiceReader
 from skinware.tactile import ContactsReader, EventKind
 
 
-def act(identity: int) -> None:
+def act(joints: ServiceReader[Any] | None) -> None:
     """Stop the hand, or let go: whatever must not wait. Take it back at WITHDRAWN."""
+    if joints is not None:
+        joints.call("hold")
 
 
 def main() -> None:
     """Entry point."""
     namespace = sys.argv[1] if len(sys.argv) > 1 else "calm"
     Profile.fifo(41).apply()  # ahead of the drivers; refused without the right, with a warning
-    with ContactsReader(namespace=namespace, timeout_s=10) as contacts:
+    with ExitStack() as stack:
+        contacts = stack.enter_context(ContactsReader(namespace=namespace, timeout_s=10))
+        joints = stack.enter_context(ServiceReader(sys.argv[2], timeout_s=10)) if len(sys.argv) > 2 else None
+        begun = set()
         for event in contacts.events():
-            if event.kind is EventKind.ONSET:
-                act(event.contact.id)
+            if event.kind in (EventKind.ONSET, EventKind.CONFIRMED) and event.contact.id not in begun:
+                begun.add(event.contact.id)
+                act(joints)
+            elif event.kind in (EventKind.WITHDRAWN, EventKind.ENDED):
+                begun.discard(event.contact.id)
             age_us = (now_ns() - event.acquired_ns) / 1000
             print(event.kind.name.lower(), event.contact.id, f"{age_us:.0f} us", flush=True)
 

@@ -30,6 +30,25 @@ def _window(text: str) -> int:
     return int(text)
 
 
+def _size(text: str) -> tuple[int, int]:
+    """Return height and width of an image."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise click.BadParameter(f"{text!r} is not WIDTHxHEIGHT, as in 96x48.")
+    return int(height), int(width)
+
+
+def _range(text: str) -> tuple[float, float]:
+    lowest, _, highest = text.partition("..")
+    try:
+        found = float(lowest), float(highest)
+    except ValueError:
+        found = 0.0, 0.0
+    if not found[0] < found[1]:
+        raise click.BadParameter(f"{text!r} is not LOWEST..HIGHEST, as in 0..4095.")
+    return found
+
+
 _learning_options = cli.options(
     click.option(
         "--also",
@@ -53,6 +72,41 @@ _learning_options = cli.options(
         metavar="CSV",
         type=cli.FILE,
         help="lerobot: a file of episodes: start_s,end_s,task,file.",
+    ),
+    click.option(
+        "--marks", is_flag=True, help="lerobot: each mark begins an episode, its text is the task; a mark end ends one."
+    ),
+    click.option(
+        "--as",
+        "form",
+        type=click.Choice(["tactile", "state", "images", "points"]),
+        default="tactile",
+        show_default=True,
+        help="lerobot: touch as features of its own, or as stock policies read it.",
+    ),
+    click.option(
+        "--numbers",
+        type=click.Choice(["module", "taxel"]),
+        default="module",
+        show_default=True,
+        help="lerobot, as state: sum and largest value of each module, or each taxel.",
+    ),
+    click.option(
+        "--size", type=_size, default="64x64", show_default=True, metavar="WIDTHxHEIGHT", help="lerobot, as images."
+    ),
+    click.option(
+        "--colours",
+        type=click.Choice(["grey", "signed", "log"]),
+        default="grey",
+        show_default=True,
+        help="lerobot, as images.",
+    ),
+    click.option(
+        "--range",
+        "value_range",
+        type=_range,
+        metavar="LOWEST..HIGHEST",
+        help="lerobot, as images: darkest and brightest value.  [default: of the sensor type]",
     ),
     click.option(
         "--gap",
@@ -110,6 +164,7 @@ _LEARNING_FORMATS = ("lerobot",)
     "skin-convert walk.mcap --to foxglove                   for Foxglove and Lichtblick",
     "skin-convert walk.mcap --to ros2                       a bag of ROS 2",
     "skin-convert pick.mcap --to lerobot --fps 30 --join observation.state=joints.csv    a learning set",
+    "skin-convert pick.mcap --to lerobot --as images --size 96x48 --marks",
     "skin-convert data.csv --guess > map.toml               your own data: which columns are taxels?",
     "skin-convert data.csv --map map.toml --to mcap         a recording of them",
 )
@@ -249,6 +304,8 @@ def _learning_set(
         within_s=options["within"],
         at=options["at"],
         each_structure=options["each_structure"],
+        by_marks=options["marks"],
+        **{name: options[name] for name in ("form", "numbers", "size", "colours", "value_range")},
     )
     return convert_to_learning_set([file, *options["also"]], output, wanted, selection, **time_and_end)
 

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 from skinware.conversion.arrays import write_hdf5, write_npz
 from skinware.conversion.mcap_files import ros2_without, viewers_without, write_foxglove, write_recording, write_ros2
@@ -19,6 +19,9 @@ from skinware.conversion.tables import RecordedSource, Selection, TableSource
 from skinware.errors import ConfigurationError
 from skinware.recording import Recording
 from skinware.recording.wire import Chosen, Exported, export_candump, export_pcapng
+
+if TYPE_CHECKING:
+    from skinware.conversion.foreign import ImportedSource
 
 
 class Format(NamedTuple):
@@ -125,13 +128,7 @@ def convert_foreign(
         return _written(ImportedSource(columns, map_path, report, is_stopped), target, form, "no row in it")
 
 
-class _CountedSource(TableSource, Protocol):
-    """A source that counts the samples it has given."""
-
-    frames: Counter[str]
-
-
-def _written(source: _CountedSource, target: Path, form: Format, why_empty: str) -> Converted:
+def _written(source: RecordedSource | ImportedSource, target: Path, form: Format, why_empty: str) -> Converted:
     with begun_beside(target) as begun:
         form.write(source, begun)
         if not source.frames.total():
@@ -167,15 +164,11 @@ def begun_beside(target: Path) -> Iterator[Path]:
         raise
 
 
-class _Export(Protocol):
-    def __call__(self, recording: Recording, path: Path, chosen: Chosen) -> Exported: ...
-
-
 class WireFormat(NamedTuple):
     """A format of recorded wires: the suffix of its files, and the function that writes one."""
 
     suffix: str
-    export: _Export
+    export: Callable[[Recording, Path, Chosen], Exported]
 
 
 WIRE_FORMATS = {"candump": WireFormat(".log", export_candump), "pcapng": WireFormat(".pcapng", export_pcapng)}

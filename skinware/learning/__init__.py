@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from skinware.learning.features import contact_numbers, slip, spectrogram
 from skinware.learning.images import Colours, TouchImage
 from skinware.learning.live import ChosenSensors, LiveImage, LiveTouch, Totals, TouchSample, points
+from skinware.learning.model_service import ModelService, onnx_model
 
 if TYPE_CHECKING:
     from skinware.learning.datasets import RecordedWindows, StreamedSamples, torch_dataset, torch_iterable
@@ -17,12 +18,14 @@ __all__ = [
     "Colours",
     "LiveImage",
     "LiveTouch",
+    "ModelService",
     "RecordedWindows",
     "StreamedSamples",
     "Totals",
     "TouchImage",
     "TouchSample",
     "contact_numbers",
+    "onnx_model",
     "points",
     "slip",
     "spectrogram",

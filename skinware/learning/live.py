@@ -24,6 +24,9 @@ from skinware.tactile.regions import Region, Regions, read_regions
 
 Positions = npt.NDArray[np.int64]
 
+_LONGEST_WAIT = 2
+"""So many periods a sample that may be nearer is waited for; it comes within half a period of a driver in time."""
+
 
 @dataclass(frozen=True)
 class ChosenSensors:
@@ -150,7 +153,9 @@ class LiveTouch:
         return self
 
     def now(self) -> TouchSample:
-        """Return the touch nearest to this moment; wait half a period at most, if that may be one to come.
+        """Return the touch nearest to this moment: the newest one, unless it is more than half a period old.
+
+        Then the next one is waited for, at most two periods of the driver.
 
         Raises:
             ServiceTimeout: a driver died, is silent, or came back with other sensors (``when_stale="raise"``).
@@ -188,8 +193,8 @@ class LiveTouch:
     def _nearest(self, skin: Skin, time_ns: int) -> Snapshot:
         snapshot = skin.read(timeout_s=0.0)
         self._check(snapshot)
-        half_ns = max(sample.period_ns for sample in snapshot.samples) // 2
-        while (left_ns := time_ns + half_ns - now_ns()) > 0 and self._may_be_nearer(snapshot, time_ns):
+        longest_ns = _LONGEST_WAIT * max(sample.period_ns for sample in snapshot.samples)
+        while (left_ns := time_ns + longest_ns - now_ns()) > 0 and self._may_be_nearer(snapshot, time_ns):
             with contextlib.suppress(ServiceTimeout):
                 snapshot = skin.read(newer_than=snapshot, timeout_s=left_ns / NS_PER_S)
         nearest = skin.at(time_ns).nearest
@@ -206,7 +211,7 @@ class LiveTouch:
     def _may_be_nearer(self, snapshot: Snapshot, time_ns: int) -> bool:
         """Return whether a sample to come can be nearer to the moment than the newest one."""
         return any(
-            0 < sample.period_ns < 2 * (time_ns - sample.acquired_ns) <= 3 * sample.period_ns
+            sample.period_ns / 2 < time_ns - sample.acquired_ns <= self._limit_ns(sample.period_ns)
             for sample in snapshot.samples
         )
 

@@ -21,7 +21,7 @@ from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S
 from skinware.service import ServiceWriter
 from skinware_drivers.bus import Bus, FrameBatch
-from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware, Pressing, WireFrame
+from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware, Pressing, WireFrame, put_away
 
 _STATUS_NS = 1_000_000_000
 _RETRY_NS = 2_000_000
@@ -162,6 +162,7 @@ class Emulation:
                 self._poll(descriptors, max(0, min(moments) - self._clock()) / 1e9)
         finally:
             self._bus.close()
+            put_away(self._hardware)
         self._report("stopped", **self._totals())
 
     def _step(self, now_ns: int) -> int | None:

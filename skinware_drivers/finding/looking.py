@@ -163,7 +163,7 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> ProbeA
 
 
 def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> list[HeardTopic]:
-    """Return the topics of a domain of DDS (``dds://0``), and which drivers can read each; nothing is published.
+    """Return the topics of a domain (``dds://0``, ``ros2://0``), and which drivers can read each; nothing is published.
 
     Raises:
         BusNotAvailable: the domain cannot be joined.

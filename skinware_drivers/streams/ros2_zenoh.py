@@ -27,7 +27,7 @@ if find_spec("zenoh") is None or find_spec("xxhash") is None:
 from skinware.bridge.link import Link
 from skinware.ros2.rmw_zenoh import ROUTER, MessageAttachment, gid, graph_endpoints
 
-_TOKEN_PARTS = 13
+_TOKEN_PARTS, _MOST_TOKENS = 13, 8192
 _AT_ONCE = 64
 """Samples in one read."""
 
@@ -94,7 +94,7 @@ class ZenohPort(TopicPort):
         super().__init__(topics)
         self._domain, self._depth = domain, options.depth
         self._samples: deque[tuple[str, bytes, bytes]] = deque()
-        self._tokens: deque[tuple[str, bool]] = deque()
+        self._tokens: deque[tuple[str, bool]] = deque(maxlen=_MOST_TOKENS)
         self._sequences: dict[str, tuple[bytes, int]] = {}
         self._ends: list[Callable[[], None]] = []
         self._event = -1
@@ -166,7 +166,7 @@ class ZenohPort(TopicPort):
     def _sample(self, key: str, attachment: bytes, payload: bytes) -> None:
         """Keep a sample; called in threads of zenoh."""
         if len(self._samples) < self._depth:  # its number shows later that it is missing
-            self._samples.append((key, attachment, payload))
+            self._samples.append((key, attachment, payload[: LONGEST + 1]))
             self._wake()
 
     def _token(self, token: str, is_there: bool) -> None:

@@ -25,6 +25,7 @@ from skinware_drivers.virtual.hardware import (
     WireFrame,
     emulators_instead,
     load_emulator,
+    put_away,
 )
 from skinware_drivers.virtual.stage import Stage
 
@@ -173,6 +174,7 @@ class VirtualCanBus(Bus):
             self._timer.close()
             self._timer = None
         self._pending = []
+        put_away(self.hardware)
 
     # Faults of the bus itself, for tests
 

@@ -163,6 +163,13 @@ def emulators_instead(medium: str) -> str:
     return f"; emulators that fit: {', '.join(fitting)}" if fitting else ""
 
 
+def put_away(hardware: EmulatedHardware) -> None:
+    """Take away what devices publish beside their frames, if they do."""
+    close = getattr(hardware, "close", None)
+    if close is not None:
+        close()
+
+
 def name_of(emulator: type) -> str:
     """Return the name under which an emulator is registered; if it is not, that of its module."""
     here = f"{emulator.__module__}:{emulator.__qualname__}"

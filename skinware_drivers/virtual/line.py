@@ -24,6 +24,7 @@ from skinware_drivers.virtual.hardware import (
     emulators_instead,
     load_emulator,
     medium_of,
+    put_away,
 )
 
 _LONGEST_BACKLOG_NS = 1_000_000_000
@@ -138,6 +139,7 @@ class EmulatedPort(Port):
 
     def close(self) -> None:
         self._timer.close()
+        put_away(self._hardware)
 
     def vanish(self) -> None:
         self._is_away = True

@@ -21,10 +21,11 @@ from skinware_drivers.options import HasOptions
 from skinware_drivers.virtual.device import DATA, Device, EmulatorOptions
 from skinware_drivers.virtual.events import Event, FrameDamage
 from skinware_drivers.virtual.hardware import EventLog, WireFrame, name_of
+from skinware_drivers.virtual.physics import WORLD_NS, open_world
 from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Wire
 
 if TYPE_CHECKING:  # needs MuJoCo
-    from skinware_drivers.virtual.physics.world import World
+    from skinware_drivers.virtual.physics.world import PhysicsWorld
 
 OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
 
@@ -33,8 +34,6 @@ _MOST_LISTED = 40
 _REPLY_NS = 200_000
 _LONGEST_CATCH_UP_NS = 1_000_000_000
 """Time that ``skip`` still emulates frame by frame; earlier time is jumped over."""
-_WORLD_NS = 4_000_000
-"""Time between two looks at the commands of a world."""
 
 
 class Stage(ABC, HasOptions[OptionsT]):
@@ -81,7 +80,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.counts: dict[str, int] = dict.fromkeys(counted, 0)
         self.silent: set[str] = set()
         self.devices: dict[int, Device] = {}
-        self.world: World | None = self._open_world() if options.world else None
+        self.world: PhysicsWorld | None = open_world(options, name_of(type(self)))
         self._foreign: ForeignTraffic | None = None
         self._scheduled: list[tuple[int, Callable[[int], object]]] = []
         self._now_ns: int | None = None
@@ -283,6 +282,11 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.counts["unheard"] += unheard
         return unheard
 
+    def close(self) -> None:
+        """Take away what a world publishes until the devices run on. Idempotent."""
+        if self.world is not None:
+            self.world.close()
+
     def totals(self) -> dict[str, int]:
         """Return exact counts since power-up."""
         return dict(self.counts)
@@ -298,8 +302,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         options = self.options
         for number in self.numbers:
             self.devices[number] = self.make_device(number, now_ns)
-        if self.world is not None:
-            self._run_world(now_ns)
+        self._run_world(now_ns)
         for device in self.devices.values():
             self.boot(device, now_ns)
         for number in self.dying():
@@ -318,28 +321,11 @@ class Stage(ABC, HasOptions[OptionsT]):
             others, queue = self.foreign_identifiers(random), self.wire.attach()
             self._foreign = ForeignTraffic(others, options.foreign_hz, random, queue, self.log, self.counts, now_ns)
 
-    def _open_world(self) -> World:
-        try:
-            from skinware_drivers.virtual.physics.binding import find_binding
-            from skinware_drivers.virtual.physics.world import World
-        except ModuleNotFoundError as error:
-            if error.name != "mujoco":
-                raise
-            raise ConfigurationError("option world: MuJoCo is not installed: pip install 'skinware[mujoco]'") from None
-        options = self.options
-        return World(
-            find_binding(options.world, name_of(type(self))),
-            seed=options.seed,
-            speed=options.world_speed,
-            has_services=options.world_services,
-        )
-
     def _run_world(self, time_ns: int) -> None:
         """Let the physics run on, and look at its commands, again and again."""
-        if self.world is not None:
+        if self.world is not None and self._now_ns is not None:
             self.world.advance(time_ns)
-        now_ns = time_ns if self._now_ns is None else self._now_ns
-        self.schedule(max(time_ns + _WORLD_NS, now_ns - _LONGEST_CATCH_UP_NS), self._run_world)
+            self.schedule(max(time_ns + WORLD_NS, self._now_ns - _LONGEST_CATCH_UP_NS), self._run_world)
 
     def dying(self) -> Sequence[int]:
         """Return the devices that die at the time of the option ``dead_after_s``."""

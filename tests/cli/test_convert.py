@@ -76,6 +76,10 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["walk.mcap", "--to", "lerobot", "--episodes", "no.csv"], 2, "no.csv: No such file or directory"),
         (["walk.mcap", "--to", "lerobot", "--join", "action=no.csv"], 2, "no.csv: No such file or directory"),
         (["walk.mcap", "--to", "lerobot", "--also", "no.mcap"], 2, "no.mcap: No such file or directory"),
+        (["walk.mcap", "--to", "lerobot", "--size", "9"], 2, "'9' is not WIDTHxHEIGHT, as in 96x48"),
+        (["walk.mcap", "--to", "lerobot", "--range", "9..1"], 2, "'9..1' is not LOWEST..HIGHEST, as in 0..4095"),
+        (["walk.mcap", "--to", "lerobot", "--marks"], 2, "no mark in it begins an episode"),
+        (["walk.mcap", "--to", "lerobot", "--as", "images"], 2, "temperature has no range of values of its own"),
         (["walk.mcap", "--to", "lerobot", "--start", "9"], 2, "no frames of a driver are in it"),
         (["walk.mcap", "--to", "lerobot", "-o", "walk.mcap"], 2, "walk.mcap: exists already: give another name"),
     ],
@@ -222,3 +226,10 @@ def test_mistakes_with_data_of_other_programs(
     monkeypatch.chdir(tmp_path)
     assert exit_status(convert, ["data.csv", *arguments]) == 2
     assert words in capsys.readouterr().err
+
+
+def test_touch_as_images_of_a_size_and_range(file: Path) -> None:
+    options = ["--as", "images", "--type", "temperature", "--range", "0..100", "--size", "40x20", "--colours", "log"]
+    assert exit_status(convert, [str(file), "--to", "lerobot", *options]) == 0
+    features = json.loads(Path("walk-lerobot/meta/info.json").read_text())["features"]
+    assert features["observation.images.touch"]["shape"] == [20, 40, 3]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import tracemalloc
 from collections.abc import Callable, Sequence
@@ -17,8 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+import skinware.recording
 from skinware import Status, Structure
-from skinware.conversion import Selection
+from skinware.conversion import Selection, convert_foreign
+from skinware.conversion.foreign import guess, open_source
 from skinware.conversion.learning import (
     Interval,
     Join,
@@ -36,6 +39,8 @@ from skinware.conversion.learning.wanted import Joined, matched
 from skinware.conversion.mcap_files import write_recording
 from skinware.conversion.tables import Table
 from skinware.errors import BadRecording, ConfigurationError
+from skinware.learning.images import Colours, TouchImage
+from skinware.skin_layout import SkinLayout
 from tests.cli.fake_skin import fake_structure
 from tests.recording.lerobot_format import Read, read_dataset
 from tests.recording.made import START_NS, MadeSource, MadeTable, generation_of_driver, generation_of_service
@@ -662,3 +667,107 @@ def test_nothing_is_left_of_one_that_was_stopped(made: Made, tmp_path: Path) -> 
     (tmp_path / "set").mkdir()
     with pytest.raises(FileExistsError):
         convert_to_learning_set([made.path], tmp_path / "set", LearningSet())
+
+
+# -- forms that stock policies read ---------------------------------------------------------------------------------
+
+
+def good(table: MadeTable, rows: Sequence[int]) -> npt.NDArray[Any]:
+    """(rows, sensors) of pressure, 0 where the status is not good."""
+    return np.where(status_of(table, "pressure") == 0, physical(table, "pressure"), 0)[rows]
+
+
+ROWS = [int(row / 30 * 100 + 1e-6) for row in range(60)]
+ONE_TYPE = Selection(types=("pressure",))
+
+
+def test_touch_as_state_is_beside_the_joints(made: Made, tmp_path: Path) -> None:
+    seconds = np.arange(200) / 100
+    (tmp_path / "joints.csv").write_text(
+        "time_s,hip\n" + "".join(f"{second:.3f},{second * 2:.3f}\n" for second in seconds)
+    )
+    joins = [Join("observation.state", tmp_path / "joints.csv")]
+    read = learn(made, LearningSet(form="state", joins=joins), selection=ONE_TYPE)
+    values = good(made.tables[0], ROWS)[-len(read.features["observation.state"]) :]
+    state = read.features["observation.state"]
+    names = read.info["features"]["observation.state"]["names"]
+    module = "touch.board_7.triangle_0"
+    assert names == [
+        "hip",
+        f"{module}.sum",
+        f"{module}.peak",
+        *(n.replace("_0", "_1") for n in names[1:3]),
+        "touch.age_s",
+    ]
+    assert not any(name.startswith(TACTILE) for name in read.features)
+    assert state[:, 1] == pytest.approx(values[:, :10].sum(axis=1), rel=1e-5)
+    assert state[:, 4] == pytest.approx(values[:, 10:].max(axis=1))
+    assert (state[:, 5] < 0.02).all()
+    each = learn(
+        [made.path.rename(_folder(tmp_path) / "again.mcap")],
+        LearningSet(form="state", numbers="taxel"),
+        selection=ONE_TYPE,
+    )
+    assert np.array_equal(each.features["observation.state"][:, :20], good(made.tables[0], ROWS))
+
+
+def test_touch_as_images_has_the_colours_of_its_values(made: Made) -> None:
+    read = learn(made, LearningSet(form="images", size=(24, 48)), selection=ONE_TYPE)
+    images = read.features["observation.images.touch"]
+    layout = SkinLayout(("torso",), (made.tables[0].structure,))  # type: ignore[arg-type]
+    expected = TouchImage(layout, "pressure", np.arange(20), 24, 48, Colours("grey", 0, 255))
+    values = good(made.tables[0], ROWS)
+    for row in (0, 17, 59):
+        assert np.array_equal(np.asarray(Image.open(io.BytesIO(images[row]))), expected.of(values[row]))
+    assert read.info["features"]["observation.images.touch"]["shape"] == [24, 48, 3]
+
+
+def test_touch_as_points_has_places_and_forces(made: Made) -> None:
+    read = learn(made, LearningSet(form="points"))
+    assert read.features[f"{TACTILE}points_pressure"].shape == (60, 20, 6)
+    assert read.features[f"{TACTILE}points_temperature"].shape == (60, 4, 6)
+
+
+def test_forms_that_cannot_be_made_are_refused(made: Made) -> None:
+    with pytest.raises(ConfigurationError, match="one sample in a row: leave out --window"):
+        learn(made, LearningSet(form="state", window=2))
+    with pytest.raises(ConfigurationError, match="temperature has no range of values of its own: give --range"):
+        learn(made, LearningSet(form="images"))
+
+
+def test_marks_begin_and_end_episodes(tmp_path: Path) -> None:
+    marks = [(0.2, "pick"), (0.8, "end"), (1.0, ""), (1.5, "drop")]
+    source = MadeSource([table_of("torso", fake_structure(1, 2, dtype="<u2"), range(200))])
+    source.events = [
+        {"event": "mark", "service": "", "time_ns": 0, "text": text, "log_time_ns": START_NS + round(at_s * 1e9)}
+        for at_s, text in marks
+    ]
+    path = tmp_path / "day.mcap"
+    write_recording(source, path)
+    read = learn([path], LearningSet(fps=10, by_marks=True, task="else"))
+    assert [(each["tasks"], each["length"]) for each in read.episodes] == [(["pick"], 6), (["else"], 5), (["drop"], 5)]
+    with pytest.raises(ConfigurationError, match="either at marks or listed"):
+        LearningSet(by_marks=True, intervals=[Interval(0, 1)])
+    source.events, none = [], _folder(tmp_path) / "none.mcap"
+    write_recording(source, none)
+    with pytest.raises(ConfigurationError, match="no mark in it begins an episode"):
+        learn([none], LearningSet(by_marks=True))
+
+
+def _folder(tmp_path: Path) -> Path:
+    """Another one, for another set."""
+    (tmp_path / "more").mkdir()
+    return tmp_path / "more"
+
+
+def test_a_set_becomes_a_recording_again(made: Made, tmp_path: Path) -> None:
+    set_of_all = convert_to_learning_set([made.path], tmp_path / "set", LearningSet(), ONE_TYPE).path
+    file = tmp_path / "map.toml"
+    with contextlib.closing(open_source(set_of_all)) as source:
+        file.write_text(guess(source))
+    back = convert_foreign(set_of_all, tmp_path / "back.mcap", "mcap", file).path
+    with skinware.recording.open(back) as recording:
+        (driver,) = recording.drivers
+        series = recording[driver].read()
+        assert np.array_equal(series.physical("pressure"), physical(made.tables[0], "pressure")[ROWS])
+        assert np.allclose(np.diff(series.acquired_ns), 1e9 / 30, atol=1e5)

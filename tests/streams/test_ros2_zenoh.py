@@ -170,6 +170,10 @@ def test_samples_that_are_lost_or_wrong_are_counted(at: Router) -> None:
         port._sample("5/touch/std_msgs::msg::dds_::Int8_/x", MessageAttachment(8, 0, bytes(16)).packed(), sample)
         assert port.read(0).count(sample) == 1
         assert (port.dropped, port.refused) == (3, 2)
+        port._sample(key, MessageAttachment(8, 10**18, bytes(16)).packed(), bytes(1 << 21))
+        assert len(port._samples[0][2]) < 1 << 21
+        assert port.read(0) == b""
+        assert port.refused == 3
 
 
 def test_topics_are_found(at: Router) -> None:

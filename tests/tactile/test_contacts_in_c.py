@@ -14,6 +14,7 @@ import pytest
 
 from skinware import Namespace
 from skinware.realtime import now_ns
+from skinware.service import ServiceWriter
 from skinware.tactile.contacts_service import ContactsWriter
 from tests.compiling import compiled
 from tests.core.test_c_how_to import lines_of
@@ -72,6 +73,32 @@ def test_a_reflex_in_python_acts_on_an_onset(namespace: Namespace) -> None:
             check(process.stdout.readline())
         finally:
             process.send_signal(signal.SIGINT)
+
+
+def test_a_reflex_stops_the_joints_of_a_hand(namespace: Namespace) -> None:
+    words = [sys.executable, str(EXAMPLES / "reflex.py"), namespace.name, "joints"]
+    held: list[str] = []
+
+    def hold() -> None:
+        """Stop."""
+        held.append("held")
+
+    operations = {"hold": hold}
+    with (
+        ServiceWriter("joints", {"target": (np.float64, 1)}, namespace=namespace, operations=operations) as joints,
+        onset(namespace),
+        subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process,
+    ):
+        assert process.stdout is not None
+        joints.begin()
+        joints.commit(now_ns())
+        try:
+            while not held:
+                joints.answer_requests(0.1)
+            check(process.stdout.readline())
+        finally:
+            process.send_signal(signal.SIGINT)
+    assert held == ["held"]
 
 
 @contextmanager

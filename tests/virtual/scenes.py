@@ -11,7 +11,7 @@ import numpy.typing as npt
 from skinware_drivers.virtual.device import EmulatorOptions
 from skinware_drivers.virtual.hardware import load_emulator
 from skinware_drivers.virtual.physics.binding import SCENES, Bound
-from skinware_drivers.virtual.physics.body import Scene
+from skinware_drivers.virtual.physics.body import PhysicsScene
 from skinware_drivers.virtual.physics.transfer import Transfer
 
 PAD = SCENES / "pad.xml"
@@ -69,7 +69,7 @@ def expected_counts(
     bound: Bound, sampled: list[tuple[int, float]], seed: int = EmulatorOptions().seed
 ) -> list[dict[int, npt.NDArray[np.float64]]]:
     """Return the counts of each module of the device at each sample: MuJoCo's data, through the transfer."""
-    scene = Scene(bound)
+    scene = PhysicsScene(bound)
     transfers = [
         Transfer(bound.settings(module.binding), module.position_m, (seed, module.binding.device, number))
         for number, module in enumerate(scene.modules)
@@ -88,7 +88,7 @@ def expected_counts(
     return found
 
 
-def course_of(scene: Scene, until_s: float, every_s: float = 0.02) -> Any:
+def course_of(scene: PhysicsScene, until_s: float, every_s: float = 0.02) -> Any:
     """Step a scene by its own moves; yield (time_s, normal force on each module, N, contacts of modules)."""
     while scene.time_s < until_s - every_s / 2:
         scene.step_to(scene.time_s + every_s)

@@ -15,10 +15,10 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml, read_geometry
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.physics.binding import find_binding
-from skinware_drivers.virtual.physics.body import Scene, Touching, spread
+from skinware_drivers.virtual.physics.body import PhysicsScene, Touching, spread
 from skinware_drivers.virtual.physics.taxels import places_in
 from skinware_drivers.virtual.physics.transfer import Transfer, TransferSettings
-from skinware_drivers.virtual.physics.world import World
+from skinware_drivers.virtual.physics.world import PhysicsWorld
 
 from .rig import MS, START_NS
 from .scenes import PAD, hardware_in, on_the_pad
@@ -26,11 +26,11 @@ from .scenes import PAD, hardware_in, on_the_pad
 GRID = "rows = 4\ncolumns = 4"
 
 
-def pad(folder: Path, *modules: str) -> Scene:
-    return Scene(find_binding(on_the_pad(folder, *(modules or (GRID,))), "xela"))
+def pad(folder: Path, *modules: str) -> PhysicsScene:
+    return PhysicsScene(find_binding(on_the_pad(folder, *(modules or (GRID,))), "xela"))
 
 
-def pressed(scene: Scene, force_n: float = 3.0, x: float = 0.0, y: float = 0.0) -> Scene:
+def pressed(scene: PhysicsScene, force_n: float = 3.0, x: float = 0.0, y: float = 0.0) -> PhysicsScene:
     scene.move({"press": -1.0, "x": x, "y": y})
     scene.step_to(scene.time_s + 0.3)
     scene.move({"press": force_n})
@@ -58,15 +58,18 @@ def test_a_geometry_file_becomes_taxels_and_comes_back(tmp_path: Path) -> None:
 
 def test_some_sensors_of_a_geometry_file(tmp_path: Path) -> None:
     group = GeometryGroup("pressure", "pad", (9, 7, 8), ((0.0, 0.0, 0.0), (0.003, 0.0, 0.0), (0.006, 0.0, 0.0)))
-    (tmp_path / "places.toml").write_text(geometry_to_toml([group]))
-    scene = pad(tmp_path, 'geometry = "places.toml"\nuid = [7, 8]')
+    elsewhere = GeometryGroup("pressure", "chest", (6,), ((0.0, 0.0, 0.0),))
+    (tmp_path / "places.toml").write_text(geometry_to_toml([elsewhere, group]))
+    scene = pad(tmp_path, 'geometry = "places.toml"\nuid = [6, 8]')
     assert scene.modules[0].position_m.tolist() == [[0.003, 0, 0], [0.006, 0, 0]], "in the order of their uid"
 
 
 def test_a_grid_is_let_down_onto_a_round_body(tmp_path: Path) -> None:
     binding = find_binding(on_the_pad(tmp_path, GRID), "xela")
     ball = msgspec.structs.replace(binding.binding.module[0], body="ball", rows=5, columns=5)
-    scene = Scene(msgspec.structs.replace(binding, binding=msgspec.structs.replace(binding.binding, module=(ball,))))
+    scene = PhysicsScene(
+        msgspec.structs.replace(binding, binding=msgspec.structs.replace(binding.binding, module=(ball,)))
+    )
     [module] = scene.modules
     assert np.linalg.norm(module.position_m, axis=1) == pytest.approx(0.012)
     assert module.axes[:, 2] == pytest.approx(module.position_m / 0.012, abs=1e-6)
@@ -191,7 +194,7 @@ def test_the_physics_runs_in_the_time_of_the_devices_or_n_times_as_fast(tmp_path
 
 
 def test_time_that_nobody_asked_for_is_left_out_and_said(tmp_path: Path) -> None:
-    world = World(find_binding(on_the_pad(tmp_path, GRID), "xela"))
+    world = PhysicsWorld(find_binding(on_the_pad(tmp_path, GRID), "xela"))
     world.advance(START_NS)
     world.advance(START_NS + 3_000 * MS)
     assert world.scene.time_s == pytest.approx(1.0, abs=0.002)
@@ -251,11 +254,11 @@ def test_a_body_that_is_not_there_and_a_scene_that_is_none_are_refused(tmp_path:
     text = file.read_text()
     file.write_text(text.replace('body = "pad"', 'body = "palm"'))
     with pytest.raises(ConfigurationError, match="has no body 'palm'"):
-        Scene(find_binding(world, "xela"))
+        PhysicsScene(find_binding(world, "xela"))
     (tmp_path / "bad.xml").write_text("<mujoco><worldbody><geom/></worldbody></mujoco>")
     file.write_text(text.replace(str(PAD), "bad.xml"))
     with pytest.raises(ConfigurationError, match="MuJoCo: "):
-        Scene(find_binding(world, "xela"))
+        PhysicsScene(find_binding(world, "xela"))
 
 
 def test_without_mujoco_the_option_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

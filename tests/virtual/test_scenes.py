@@ -10,7 +10,7 @@ import numpy as np
 
 from skinware_drivers.virtual.hardware import load_emulator
 from skinware_drivers.virtual.physics.binding import SCENES, find_binding
-from skinware_drivers.virtual.physics.body import Scene
+from skinware_drivers.virtual.physics.body import PhysicsScene
 
 from .rig import MS, START_NS
 from .scenes import course_of
@@ -18,11 +18,11 @@ from .scenes import course_of
 SHIPPED = sorted(path.name.removesuffix(".toml").split(".") for path in SCENES.glob("*.toml"))
 
 
-def scene_of(name: str, driver: str) -> Scene:
-    return Scene(find_binding(f"mujoco:{name}", driver))
+def scene_of(name: str, driver: str) -> PhysicsScene:
+    return PhysicsScene(find_binding(f"mujoco:{name}", driver))
 
 
-def body_at(scene: Scene, name: str) -> list[float]:
+def body_at(scene: PhysicsScene, name: str) -> list[float]:
     place: list[float] = scene.data.body(name).xpos.tolist()
     return place
 
@@ -58,14 +58,14 @@ def test_the_gripper_lifts_slips_drops_and_hands_over() -> None:
 def test_the_hand_grasps_with_all_fingers_and_lets_go() -> None:
     scene = scene_of("hand", "inspire")
     assert sum(len(module.position_m) for module in scene.modules) == 1062
-    by_time = {round(time_s, 2): force_n for time_s, force_n, _ in course_of(scene, 10.5)}
+    by_time = {round(time_s, 2): force_n for time_s, force_n, _ in course_of(scene, 14.5)}
     names = [module.name for module in scene.modules]
     for finger in ("little", "ring", "middle", "index", "thumb"):
-        assert sum(by_time[6][row] for row, name in enumerate(names) if name.startswith(finger)) > 1
-        assert sum(by_time[10.4][row] for row, name in enumerate(names) if name.startswith(finger)) == 0
+        assert sum(by_time[10][row] for row, name in enumerate(names) if name.startswith(finger)) > 1
+        assert sum(by_time[14.4][row] for row, name in enumerate(names) if name.startswith(finger)) == 0
     palm = names.index("palm")
-    assert by_time[3][palm] == pytest.approx(0.2 * 9.81, rel=0.02), "the weight of the bottle"
-    assert by_time[6][palm] > 10
+    assert by_time[7][palm] == pytest.approx(0.2 * 9.81, rel=0.02), "the weight of the bottle"
+    assert by_time[10][palm] > 10
 
 
 def test_the_forearm_is_stroked_bumped_and_held() -> None:

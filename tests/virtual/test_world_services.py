@@ -18,7 +18,7 @@ from skinware.realtime import now_ns
 from skinware.service import ServiceReader
 from skinware.tactile.calibration.sources import POINT, PoseSource
 from skinware_drivers.virtual.physics.binding import find_binding
-from skinware_drivers.virtual.physics.world import World
+from skinware_drivers.virtual.physics.world import PhysicsWorld
 from tests.commands import running
 
 from .rig import MS
@@ -28,13 +28,13 @@ MODULE = "rows = 4\ncolumns = 4"
 
 
 @pytest.fixture
-def world(tmp_path: Path, namespace: Namespace) -> Iterator[World]:
-    world = World(find_binding(on_the_pad(tmp_path, MODULE), "xela"), has_services=True)
+def world(tmp_path: Path, namespace: Namespace) -> Iterator[PhysicsWorld]:
+    world = PhysicsWorld(find_binding(on_the_pad(tmp_path, MODULE), "xela"), has_services=True)
     yield world
     world.close()
 
 
-def run(world: World, duration_ms: int) -> None:
+def run(world: PhysicsWorld, duration_ms: int) -> None:
     """Let the world run; its time begins 20 s ago, so that none of its samples is of the future."""
     begun_ns = world.origin_ns or now_ns() - 20_000 * MS
     at_ns = begun_ns + round(world.scene.time_s * 1e9)
@@ -47,7 +47,7 @@ def newest(name: str) -> Any:
         return reader.read(timeout_s=5)
 
 
-def test_truth_has_the_contact_its_force_and_its_place(world: World) -> None:
+def test_truth_has_the_contact_its_force_and_its_place(world: PhysicsWorld) -> None:
     run(world, 800)
     truth = newest("truth")
     [touch] = world.scene.touching()
@@ -62,7 +62,7 @@ def test_truth_has_the_contact_its_force_and_its_place(world: World) -> None:
     assert found == pytest.approx(touch.point_m), "calibration by touch reads it"
 
 
-def asked(world: World, question: Callable[[ServiceReader[Any]], object]) -> BaseException | object:
+def asked(world: PhysicsWorld, question: Callable[[ServiceReader[Any]], object]) -> BaseException | object:
     """Ask the service ``joints`` in a thread, while the world looks at requests and stands still."""
     answers: list[BaseException | object] = []
 
@@ -82,7 +82,7 @@ def asked(world: World, question: Callable[[ServiceReader[Any]], object]) -> Bas
     return answers[0]
 
 
-def test_joints_obey_poses_targets_and_hold(world: World) -> None:
+def test_joints_obey_poses_targets_and_hold(world: PhysicsWorld) -> None:
     run(world, 20)
     with ServiceReader("joints", timeout_s=5) as reader:
         assert reader.static()["actuator_name"].tolist() == [b"x", b"y", b"press"]
@@ -113,7 +113,7 @@ def test_joints_obey_poses_targets_and_hold(world: World) -> None:
         ({"pose": "press", "seconds": -1.0}, "give 0 to 3600"),
     ],
 )
-def test_a_command_that_makes_no_sense_is_refused(world: World, arguments: dict[str, Any], says: str) -> None:
+def test_a_command_that_makes_no_sense_is_refused(world: PhysicsWorld, arguments: dict[str, Any], says: str) -> None:
     error = asked(world, lambda joints: joints.call("move", **arguments))
     assert isinstance(error, RequestFailed)
     assert says in str(error)

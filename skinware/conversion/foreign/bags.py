@@ -39,12 +39,12 @@ class BagSource:
 
     def __init__(self, path: Path) -> None:
         self.path, self.share = path, 0.0
-        self._bags = package("rosbags.highlevel", "A bag of ROS")
+        bags = package("rosbags.highlevel", "A bag of ROS")
         stores = package("rosbags.typesys", "A bag of ROS")
         self._files = ExitStack()
         with self._blamed("open it with its own tools, or record it again"):
             usual = stores.get_typestore(stores.Stores.LATEST)
-            self._bag = self._files.enter_context(self._bags.AnyReader([path], default_typestore=usual))
+            self._bag = self._files.enter_context(bags.AnyReader([path], default_typestore=usual))
         try:
             firsts = {topic: next(self._messages(topic), None) for topic in self._bag.topics}
         except BaseException:
@@ -56,8 +56,9 @@ class BagSource:
             topic: {LOG_TIME: (), **{name: np.shape(each) for name, each in _columns(message).items()}}
             for topic, message in heard.items()
         }
-        frames = {topic: getattr(getattr(message, "header", None), "frame_id", "") for topic, message in heard.items()}
-        self.frames: Mapping[str, str] = frames
+        self.frames: Mapping[str, str] = {
+            topic: getattr(getattr(message, "header", None), "frame_id", "") for topic, message in heard.items()
+        }
 
     def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
         shapes, waiting, size = self.tables[table], dict[str, list[Any]]({name: [] for name in names}), 0
@@ -66,10 +67,10 @@ class BagSource:
             for name, parts in waiting.items():
                 row = np.asarray(found.get(name, ()))
                 if row.shape != shapes[name]:
-                    what = (
-                        f"{name} has the shape {row.shape}, and had {shapes[name]} at first: a skin has a fixed shape"
+                    raise ConfigurationError(
+                        f"{self.path}, {table}, message {number + 1}: {name} has the shape {row.shape}, and had"
+                        f" {shapes[name]} at first: a skin has a fixed shape"
                     )
-                    raise ConfigurationError(f"{self.path}, {table}, message {number + 1}: {what}")
                 parts.append(row)
                 size += row.nbytes
             if size > BLOCK_BYTES or number % _MOST_ROWS == _MOST_ROWS - 1:
@@ -105,17 +106,13 @@ def _columns(message: Any) -> dict[str, Any]:
     """Return the numbers of a message by name."""
     kind = getattr(message, "__msgtype__", "")
     if kind == "sensor_msgs/msg/PointCloud2":
-        return {**_stamp(message), **_points(message)}
+        return {**_column("header", message.header), **_points(message)}
     if kind == "sensor_msgs/msg/Image":
-        return {**_stamp(message), **_image(message)}
+        return {**_column("header", message.header), **_image(message)}
     found: dict[str, Any] = {}
     for each in fields(message):
         found |= _column(each.name, getattr(message, each.name))
     return found
-
-
-def _stamp(message: Any) -> dict[str, Any]:
-    return _column("header", message.header)
 
 
 def _column(name: str, value: Any) -> dict[str, Any]:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.mapping import FORMAT, UNITS_NS, VERSION
+from skinware.conversion.foreign.mapping import FORMAT, UNITS_NS, VERSION, ModuleMap
 from skinware.conversion.foreign.source import ColumnSource, Rows, first_rows
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
@@ -26,6 +25,7 @@ _NO_TAXELS = re.compile(
     r"|covariance|height|width|step|layout|offset|label|episode|frame|rgb|depth|image_raw|slip|(^|[._])id$|^column_0$",
     re.I,
 )
+_TOUCH = re.compile(r"tact|taxel|touch|skin|press", re.I)
 _TAXELS = re.compile(r"biotac|tact|taxel|touch|skin|press|force|shear|sens|temp|acc|gyro|mag|prox|hall|fsr", re.I)
 _TYPES = {
     r"temp": ("temperature", ""),
@@ -46,19 +46,12 @@ _MANY = 4
 _GENERIC = ("", "taxel", "taxels", "sensor", "s", "t", "value", "values", "data", "column", "tactile")
 
 
-@dataclass
-class _Module:
-    """Lines of a module to write."""
+class _Guess(NamedTuple):
+    """A module of so many taxels, and the reason."""
 
-    patch: str
-    module: str
-    columns: list[str]
+    map: ModuleMap
+    taxels: int
     why: str
-    type: str
-    unit: str
-    kind: str
-    count: int
-    more: list[str] = field(default_factory=list)
 
 
 def guess(source: ColumnSource) -> str:
@@ -93,7 +86,14 @@ def guess(source: ColumnSource) -> str:
 def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> list[str]:
     rows = tables[table]
     names = [name for name in rows if name != time]
-    possible = [name for name in names if not _is_other(name) and not _TIMES.fullmatch(name)]
+    beside = {f"{name}_status" for name in names} | {
+        f"{name.rpartition('.')[0]}.age" for name in names if "tactile" in name
+    }
+    possible = [
+        name
+        for name in names
+        if (_TOUCH.search(name) or not _NO_TAXELS.search(name)) and not _TIMES.fullmatch(name) and name not in beside
+    ]
     pattern = {name: _NUMBER.sub("#", _AXIS.sub("", name)) for name in possible}
     alike = Counter(pattern.values())
     wanted = [name for name in possible if _TAXELS.search(name) or alike[pattern[name]] >= _MANY] or possible
@@ -106,9 +106,6 @@ def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> l
         return []
     whole = {len(each): [name] for other in tables if other != table for name, each in tables[other].items()
              if each.shape[1:] == (3,) and _PLACES.search(name)}  # fmt: skip
-    for module in modules:
-        named = places if has_places else whole.get(module.count)
-        module.more += ["# these look like places in metres", f"positions = {_text(named)}"] if named else []
     lines = ["", "[[driver]]", f"name = {_text(driver)}"]
     lines += [f"table = {_text(table)}"] if table else []
     lines += _time_lines(rows, time)
@@ -118,18 +115,14 @@ def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> l
     dtype = next(iter(dtypes)) if dtypes <= {"uint8"} or dtypes <= {"int16"} or dtypes <= {"uint16"} else "int32"
     dtype, why = (dtype, "whole numbers") if is_whole else ("float32", "fractions")
     lines += [f"dtype = {_text(dtype)}  # {why} in the first rows"]
-    for module in modules:
-        lines += ["", "[[driver.module]]", f"# {module.why}"]
-        lines += [f"patch = {_text(module.patch)}", f"module = {_text(module.module)}"]
-        lines += [f"type = {_text(module.type)}", f"unit = {_text(module.unit)}"]
-        lines += [f"kind = {_text(module.kind)}"] if module.kind else []
-        lines += [f"columns = {_text(module.columns)}", *module.more]
+    for module, count, why in modules:
+        lines += ["", "[[driver.module]]", f"# {why}"]
+        guessed = {name: getattr(module, name) for name in ("patch", "module", "type", "unit", "kind", "columns")}
+        lines += [f"{name} = {_text(value)}" for name, value in guessed.items() if value or name != "kind"]
+        if named := places if has_places else whole.get(count):
+            lines += ["# these look like places in metres", f"positions = {_text(named)}"]
     others = [name for name in names if name not in wanted and not (has_places and name in places)]
     return [*lines, *(["", f"# not taken for taxels: {', '.join(others)}"] if others else [])]
-
-
-def _is_other(name: str) -> bool:
-    return bool(_NO_TAXELS.search(name)) and not re.search(r"tact|taxel|touch|skin|press", name, re.I)
 
 
 # -- time ---------------------------------------------------------------------------------------------------------
@@ -180,7 +173,7 @@ def _time_lines(rows: Rows, time: str) -> list[str]:
 # -- taxels -------------------------------------------------------------------------------------------------------
 
 
-def _modules(columns: Rows, driver: str) -> Iterator[_Module]:
+def _modules(columns: Rows, driver: str) -> Iterator[_Guess]:
     singles: dict[str, list[str]] = {}
     for name, rows in columns.items():
         if rows.ndim == 1:
@@ -191,7 +184,7 @@ def _modules(columns: Rows, driver: str) -> Iterator[_Module]:
         yield from _numbered(pattern, names, driver)
 
 
-def _arrays(name: str, shape: Sequence[int], driver: str) -> Iterator[_Module]:
+def _arrays(name: str, shape: Sequence[int], driver: str) -> Iterator[_Guess]:
     """Yield the modules of an array: its last two axes are rows and columns, or its last one x, y and z."""
     patch = _label(name) or driver
     has_axes = shape[-1] == 3 and (len(shape) > 1 or re.search(r"force|mag|acc|gyro|shear", name, re.I) is not None)
@@ -206,10 +199,10 @@ def _arrays(name: str, shape: Sequence[int], driver: str) -> Iterator[_Module]:
             module = " ".join(map(str, place))
             why = f"an array of {' x '.join(map(str, shape))}; {why}"
             count = int(np.prod(inner[len(outer) :]))
-            yield _Module(patch, module, [column], why, type_name, unit, kind, count)
+            yield _Guess(ModuleMap(patch, (column,), module, type_name, unit, kind=kind), count, why)
 
 
-def _numbered(pattern: str, names: Sequence[str], driver: str) -> Iterator[_Module]:
+def _numbered(pattern: str, names: Sequence[str], driver: str) -> Iterator[_Guess]:
     """Yield the modules of columns whose names differ in numbers only."""
     numbers = {name: tuple(_NUMBER.findall(name)) for name in names}
     axis = _AXIS.search(pattern)
@@ -228,8 +221,9 @@ def _numbered(pattern: str, names: Sequence[str], driver: str) -> Iterator[_Modu
         is_grid = len(sizes) == 2 and _is_grid(rest)
         kind = "x".join(map(str, sizes)) if is_grid else ""
         said = "one column" if len(group) == 1 else f"{len(group)} columns that differ in their numbers"
-        columns, said = _ranges(pattern, group, numbers), f"{said}; {why}"
-        yield _Module(patch, " ".join(place), columns, said, type_name, unit, kind, len(group))
+        columns = tuple(_ranges(pattern, group, numbers))
+        module = ModuleMap(patch, columns, " ".join(place), type_name, unit, kind=kind)
+        yield _Guess(module, len(group), f"{said}; {why}")
 
 
 def _is_grid(numbers: Any) -> bool:

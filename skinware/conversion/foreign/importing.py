@@ -188,7 +188,12 @@ class ImportedSource:
     def events(self) -> list[dict[str, Any]]:
         """A mark at the beginning of each episode of a dataset."""
         marks = self.columns.marks if isinstance(self.columns, DatasetSource) else []
-        return [self._at(round(time_s * NS_PER_S), event="mark", service="", text=text) for time_s, text in marks]
+        found = []
+        for time_s, text in marks:
+            time_ns = round(time_s * NS_PER_S)
+            own_ns, log_ns = time_ns - self.begin_ns + _BEGIN_NS, time_ns + self.shift_ns
+            found.append({"event": "mark", "service": "", "text": text, "time_ns": own_ns, "log_time_ns": log_ns})
+        return found
 
     @property
     def clock(self) -> list[dict[str, Any]]:
@@ -205,6 +210,3 @@ class ImportedSource:
 
     def close(self) -> None:
         self.columns.close()
-
-    def _at(self, time_ns: int, **what: Any) -> dict[str, Any]:
-        return {**what, "time_ns": time_ns - self.begin_ns + _BEGIN_NS, "log_time_ns": time_ns + self.shift_ns}

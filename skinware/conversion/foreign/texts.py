@@ -57,7 +57,11 @@ class TextSource:
         rows = [cells for line in data if len(cells := self._cells(self._clean(line))) == count]
         samples = {name: [cells[places[0]] for cells in rows] for name, places in self._places.items()}
         self._dates = {name for name, cells in samples.items() if all(_DATE.fullmatch(cell.strip()) for cell in cells)}
-        self._exact = {name for name, cells in samples.items() if any(map(_is_large, cells))}
+        self._exact = {
+            name
+            for name, cells in samples.items()
+            if any(cell.strip().isdecimal() and int(cell) >= _EXACT for cell in cells)
+        }
         wrong = {name: [cell for cell in cells if _number(cell) is None] for name, cells in samples.items()}
         self.left_out: Mapping[str, str] = {
             name: f"{cells[0]!r} is no number"
@@ -155,10 +159,10 @@ class TextSource:
         for line, cells in self._split(lines, first):
             cell = cells[place].strip()
             try:
-                is_date = name in self._dates
-                found.append(
-                    int(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64)) if is_date else int(cell)
-                )
+                if name in self._dates:
+                    found.append(int(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64)))
+                else:
+                    found.append(int(cell))
             except ValueError:
                 self._damaged(line, f"{cell!r} in {name} is neither a date nor an integer")
         return np.array(found, np.int64)
@@ -211,7 +215,3 @@ def _number(cell: str) -> float | None:
         return float(cell)
     except ValueError:
         return np.nan if cell.strip().lower() in _MISSING else None
-
-
-def _is_large(cell: str) -> bool:
-    return cell.strip().isdecimal() and int(cell) >= _EXACT

@@ -24,8 +24,9 @@ from skinware.conversion.learning.features import (
     SkinFeatures,
     joined_rows,
 )
+from skinware.conversion.learning.forms import Form
 from skinware.conversion.learning.timing import Episode, Planner, TimedTable
-from skinware.conversion.learning.wanted import Interval, Joined, LearningSet
+from skinware.conversion.learning.wanted import Interval, Joined, LearningSet, intervals_of_marks
 from skinware.conversion.tables import RecordedSource, Selection, Table, TableSource, pyarrow, sensor_table
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
@@ -124,6 +125,8 @@ def _sets(
         source = recordings.source(number)
         times = [(each, each.times_ns(source, is_only=len(recordings.paths) == 1)) for each in joined]
         planner = Planner(number, source, wanted, times, structures)
+        if wanted.by_marks:
+            asked[number] = intervals_of_marks(source, planner.end_s)
         if drivers not in (None, planner.drivers):
             there_are = ", ".join(sorted(planner.drivers))
             raise ConfigurationError(f"{source.path}: other drivers than the first recording ({there_are}): name some")
@@ -187,6 +190,10 @@ class _Set:
                 if name in self._features:
                     raise ConfigurationError(f"two features are both {name!r}")
                 self._features[name] = feature
+        self._form: Form | None = None
+        if wanted.form != "tactile":
+            self._form = Form(wanted, {name: timed.structure for name, timed in self._tables.items()})
+            self._features = self._form.described(self._features)
 
     def write(self, folder: Path) -> None:
         writer = DatasetWriter(folder, self._wanted.fps, self._features, [len(each) for each in self._episodes])
@@ -227,7 +234,8 @@ class _Set:
                 numbers, of_rows = np.unique(wanted, return_inverse=True)
                 frames = readers[episode.piece.tables[name]].take(numbers)
                 batch |= skin.rows(frames, of_rows.reshape(wanted.shape), episode.times_ns[part])
-            yield batch | joined_rows(self._joined, episode.joined, part)
+            batch |= joined_rows(self._joined, episode.joined, part)
+            yield batch if self._form is None else self._form.rows(batch)
 
     def _write_beside(self, folder: Path) -> None:
         """Write what LeRobot's format lacks: the places of sensors, and the time of each episode."""

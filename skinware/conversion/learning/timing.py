@@ -142,6 +142,11 @@ class Planner:
     def drivers(self) -> frozenset[str]:
         return frozenset(self._drivers)
 
+    @property
+    def end_s(self) -> float:
+        """Time of the last sample of a driver, s since the recording began."""
+        return self._seconds(max(int(timed.times_ns[-1]) for tables in self._drivers.values() for timed in tables))
+
     def episodes(self, intervals: Sequence[Interval], task: str) -> list[Episode]:
         """Return the episodes in some intervals, in order; without intervals those of the whole recording.
 

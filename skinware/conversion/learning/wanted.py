@@ -21,6 +21,7 @@ from skinware.realtime import NS_PER_S
 from skinware.text import nearest_name
 
 _COLUMNS = ("start_s", "end_s", "task", "file")
+_END = "end"
 RESERVED = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task")
 """Features that every learning set has."""
 
@@ -72,6 +73,14 @@ class LearningSet:
         within_s: greatest distance of a joined row; None: the time between two rows.
         at: name of a joined feature whose times are those of the rows; empty: a row each 1 / fps.
         each_structure: write a set for each structure of the drivers, in folders; False: refuse several structures.
+        by_marks: each mark in a recording begins an episode, whose task is its text; a mark ``end`` only ends one.
+        form: ``tactile``: values, status and age of each driver; or in a form that stock policies of LeRobot read:
+            ``state``: numbers in ``observation.state``, as the robot ``skinware`` has them; ``images``, as the camera
+            has them; ``points``: (n, 6) places and forces.
+        numbers: of ``state``: sum and largest value of each ``module``, or each ``taxel``.
+        size: height and width of images.
+        colours: of images.
+        value_range: of the darkest and brightest colour; None: of the sensor type.
     """
 
     fps: int = 30
@@ -84,6 +93,12 @@ class LearningSet:
     within_s: float | None = None
     at: str = ""
     each_structure: bool = False
+    by_marks: bool = False
+    form: Literal["tactile", "state", "images", "points"] = "tactile"
+    numbers: Literal["module", "taxel"] = "module"
+    size: tuple[int, int] = (64, 64)
+    colours: Literal["grey", "signed", "log"] = "grey"
+    value_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if self.fps < 1 or self.window < 0:
@@ -92,6 +107,8 @@ class LearningSet:
         for name in names:
             if not name or "/" in name or name in RESERVED or names.count(name) > 1:
                 raise ConfigurationError(f"{name!r} cannot be the name of a joined feature, or is there twice")
+        if self.by_marks and self.intervals:
+            raise ConfigurationError("episodes are either at marks or listed")
         if self.at and self.at not in names:
             raise ConfigurationError(f"rows at the times of {self.at!r}: that is not joined")
 
@@ -109,6 +126,32 @@ def interval_of(text: str) -> Interval:
     """
     start, _, end = text.partition("..")
     return _interval(start, end, f"episode {text!r}")
+
+
+def intervals_of_marks(source: TableSource, end_s: float) -> list[Interval]:
+    """Return the episodes at the marks of a recording: from each to the next, or to the end.
+
+    Args:
+        source: the recording.
+        end_s: time at which it ends, s since it began.
+
+    Raises:
+        ConfigurationError: there are no marks in it.
+    """
+    marks = [
+        ((event["log_time_ns"] - source.start_ns) / NS_PER_S, str(event.get("text", "")))
+        for event in source.events
+        if event.get("event") == "mark"
+    ]
+    ends = [*(time_s for time_s, _ in marks[1:]), end_s]
+    found = [
+        Interval(max(0.0, begin_s), until_s, text or None)
+        for (begin_s, text), until_s in zip(marks, ends, strict=False)
+        if text != _END and until_s > max(0.0, begin_s)
+    ]
+    if not found:
+        raise ConfigurationError(f"{source.path}: no mark in it begins an episode: press m in skin-view")
+    return found
 
 
 def read_intervals(path: Path) -> list[Interval]:

@@ -1,1 +1,37 @@
 """Physics under emulated devices: a MuJoCo scene presses their taxels. Needs the extra ``mujoco``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.virtual.device import EmulatorOptions
+
+if TYPE_CHECKING:
+    from skinware_drivers.virtual.physics.world import PhysicsWorld
+
+WORLD_NS = 2_000_000
+"""Time between two looks at the commands of a world."""
+
+
+def open_world(options: EmulatorOptions, driver: str) -> PhysicsWorld | None:
+    """Open the world of an emulator's options; None: they have none.
+
+    Raises:
+        ConfigurationError: it cannot be used, or MuJoCo is not installed.
+    """
+    if not options.world:
+        return None
+    try:
+        from skinware_drivers.virtual.physics.binding import find_binding
+        from skinware_drivers.virtual.physics.world import PhysicsWorld
+    except ModuleNotFoundError as error:
+        if error.name != "mujoco":
+            raise
+        raise ConfigurationError("option world: MuJoCo is not installed: pip install 'skinware[mujoco]'") from None
+    return PhysicsWorld(
+        find_binding(options.world, driver),
+        seed=options.seed,
+        speed=options.world_speed,
+        has_services=options.world_services,
+    )

@@ -19,6 +19,7 @@
     at_m = [0.0, 0.0, 0.01]               # its middle, in the frame of the body
     x = [1.0, 0.0, 0.0]                   # along a row
     y = [0.0, 1.0, 0.0]                   # from row to row
+    reach_m = 0.0045                      # of a contact to its nearest taxel; by default one and a half pitches
     axes = "xyz"                          # values of each taxel; "-" is a value that stays at rest
     transfer = {noise = 2.0}              # of this module
 
@@ -30,8 +31,9 @@
     pose = "open"
     seconds = 0.5
 
-Instead of a grid, a module may name a ``geometry`` file, whose frame is that of the body, and the first and last
-``uid`` of its sensors there; or ``arm_board``, one of the boards of :func:`skinware.tactile.testing.arm`.
+Instead of a grid, a module may name a ``geometry`` file, of which it has the sensors in the coordinate frame with the
+name of its body, and the first and last ``uid`` of them; or ``arm_board``, one of the boards of
+:func:`skinware.tactile.testing.arm`.
 """
 
 from __future__ import annotations
@@ -70,6 +72,7 @@ class ModuleBinding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     arm_board: int | None = None
     geometry: str = ""
     uid: tuple[int, int] = (0, (1 << 64) - 1)
+    reach_m: _Positive | None = None
     transfer: dict[str, Any] = {}
 
     def __post_init__(self) -> None:

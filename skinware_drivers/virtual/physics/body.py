@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.physics.binding import Bound
-from skinware_drivers.virtual.physics.taxels import Taxels, add_sensors, place, place_sensors
+from skinware_drivers.virtual.physics.taxels import BoundTaxels, add_sensors, place, place_sensors
 
 ArrayF = npt.NDArray[np.float64]
 
@@ -44,7 +45,7 @@ class Touching(NamedTuple):
     slip_m_s: float
 
 
-class Scene:
+class PhysicsScene:
     """The physics of a scene and the forces on its taxels.
 
     Attributes:
@@ -52,6 +53,8 @@ class Scene:
         data: MuJoCo's state.
         modules: the taxels, in the order of the binding.
         poses: targets of actuators, by name of the pose.
+        touched_s: time of the scene when the present touch of modules began; NaN: nothing touches them.
+        commanded_s: time of the scene at the newest command from outside; NaN: there was none.
 
     Raises:
         ConfigurationError: the scene cannot be used, or does not fit its binding.
@@ -62,7 +65,7 @@ class Scene:
         try:
             spec = mujoco.MjSpec.from_file(str(bound.scene))
             bare = spec.compile()
-            self.modules: list[Taxels] = [place(bare, module, bound) for module in bound.binding.module]
+            self.modules: list[BoundTaxels] = [place(bare, module, bound) for module in bound.binding.module]
             add_sensors(spec, self.modules)
             self.model: Any = spec.compile()
         except ValueError as error:
@@ -81,6 +84,10 @@ class Scene:
         self._ramps: dict[int, tuple[float, float, float, float]] = {}  # actuator -> begin, end, from, to
         self._next_move = 0
         self._round = 0
+        self._touching: list[Touching] | None = None
+        self._is_covered = np.zeros(self.model.ngeom, bool)
+        self._is_covered[list(self._module_of)] = True
+        self.touched_s = self.commanded_s = math.nan
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         mujoco.mj_forward(self.model, self.data)
@@ -102,6 +109,11 @@ class Scene:
                 if share == 1.0:
                     del self._ramps[actuator]
             mujoco.mj_step(self.model, self.data)
+            self._touching = None
+            if not self._is_covered[self.data.contact.geom].any():
+                self.touched_s = math.nan
+            elif math.isnan(self.touched_s):
+                self.touched_s = float(self.data.time) - step_s
         return max(0, steps)
 
     def move(self, targets: Mapping[str, float], seconds: float = 0.0) -> None:
@@ -132,7 +144,9 @@ class Scene:
 
     def touching(self) -> list[Touching]:
         """Return the contacts of all modules in the newest step."""
-        found = []
+        if self._touching is not None:
+            return self._touching
+        found = self._touching = []
         for number in range(self.data.ncon):
             contact = self.data.contact[number]
             for side, sign in ((0, -1.0), (1, 1.0)):
@@ -159,7 +173,8 @@ class Scene:
         mujoco.mj_contactForce(self.model, self.data, number, force)
         body = int(self.model.geom_bodyid[geom])
         rotation = self.data.xmat[body].reshape(3, 3)
-        point = rotation.T @ (contact.pos - self.data.xpos[body])
+        place = contact.pos
+        point = rotation.T @ (place - self.data.xpos[body])
         frame = contact.frame.reshape(3, 3)
         outward = rotation.T @ (-sign * frame[0])
         reach = [distances(self.modules[m], point, outward).min() for m in self._module_of[geom]]
@@ -167,11 +182,12 @@ class Scene:
         if min(reach) > self.modules[module].reach_m:
             return None
         shear = sign * (frame[1:].T @ force[1:3])
-        speeds = []
+        speeds, turning = [], np.empty(3)
         for other in (geom, int(contact.geom[1 - side])):
             six = np.zeros(6)
             mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_GEOM, other, six, 0)
-            speeds.append(six[3:] + np.cross(six[:3], contact.pos - self.data.geom_xpos[other]))
+            mujoco.mju_cross(turning, six[:3], place - self.data.geom_xpos[other])
+            speeds.append(six[3:] + turning)
         slip = frame[1:] @ (speeds[1] - speeds[0])
         return Touching(module, point, outward, float(force[0]), rotation.T @ shear, float(np.linalg.norm(slip)))
 
@@ -201,14 +217,14 @@ class Scene:
                 raise ConfigurationError(f"{where}: {name}={target!r} is no number")
 
 
-def distances(taxels: Taxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:
+def distances(taxels: BoundTaxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:
     """Return (n,) distances of taxels from a contact, m; infinite for those that face another way."""
     distance: ArrayF = np.linalg.norm(taxels.position_m - point_m, axis=1)
     distance[taxels.axes[:, 2] @ normal < _SAME_WAY + _EPSILON] = np.inf
     return distance
 
 
-def spread(taxels: Taxels, depth_m: ArrayF, touches: Sequence[Touching]) -> ArrayF:
+def spread(taxels: BoundTaxels, depth_m: ArrayF, touches: Sequence[Touching]) -> ArrayF:
     """Return (n, 3) forces on taxels, N: shear along x and y, and normal force.
 
     The force of a contact is spread over the taxels that are nearest to it, in proportion to their depth. Where none

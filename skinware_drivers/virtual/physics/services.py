@@ -9,7 +9,7 @@ import numpy as np
 from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceWriter
-from skinware_drivers.virtual.physics.body import Scene
+from skinware_drivers.virtual.physics.body import PhysicsScene
 
 TRUTH, JOINTS = "truth", "joints"
 RATE_HZ = 100
@@ -24,7 +24,7 @@ class WorldServices:
         NameInUse: another world publishes here.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: PhysicsScene) -> None:
         self._scene = scene
         self._due_ns = 0
         n, joints, actuators = len(scene.modules), len(scene.joints), len(scene.actuators)
@@ -43,6 +43,7 @@ class WorldServices:
                 "module": Column(np.dtype("<u4"), (_MOST,), "", "of each, a row of module_name"),
                 "module_n": floats((n,), "N", "normal force on each module"),
                 "force_n": floats((1,), "N", "normal force on all modules"),
+                "touched_s": floats((1,), "s", "time of the scene when the present touch began; NaN: none"),
                 "scene_s": floats((1,), "s", "time of the scene"),
                 "lag_s": floats((1,), "s", "by which the physics is behind"),
             },
@@ -56,6 +57,7 @@ class WorldServices:
                 "position": floats((max(1, joints),), "", "of each joint, rad or m"),
                 "velocity": floats((max(1, joints),), "", "of each joint, rad/s or m/s"),
                 "target": floats((max(1, actuators),), "", "of each actuator"),
+                "commanded_s": floats((1,), "s", "time of the scene at the newest command; NaN: none yet"),
             },
             {
                 "joint_name": _texts(scene.joints),
@@ -90,10 +92,12 @@ class WorldServices:
         """
         if pose and pose not in self._scene.poses:
             raise ValueError(f"there is no pose {pose!r}; there are {', '.join(self._scene.poses)}")
+        self._scene.commanded_s = self._scene.time_s
         self._scene.move({**(self._scene.poses[pose] if pose else {}), **(targets or {})}, seconds)
 
     def hold(self) -> None:
         """Stop every movement: actuators keep the targets that they have now."""
+        self._scene.commanded_s = self._scene.time_s
         self._scene.hold()
 
     def close(self) -> None:
@@ -114,7 +118,7 @@ class WorldServices:
             columns["shear_n"][row], columns["slip_m_s"][row] = touch.shear_n, touch.slip_m_s
             columns["module"][row] = touch.module
         columns["count"][0] = min(len(touches), _MOST)
-        columns["scene_s"][0] = scene.time_s
+        columns["touched_s"][0], columns["scene_s"][0] = scene.touched_s, scene.time_s
         columns["lag_s"][0] = (now_ns() - time_ns) / NS_PER_S
         self._truth.commit(time_ns)
         columns = self._joints.begin(from_last=True)
@@ -122,6 +126,7 @@ class WorldServices:
             columns["position"][row] = scene.data.qpos[position]
             columns["velocity"][row] = scene.data.qvel[velocity]
         columns["target"][: len(scene.actuators)] = scene.data.ctrl
+        columns["commanded_s"][0] = scene.commanded_s
         self._joints.commit(time_ns)
 
 
@@ -129,5 +134,5 @@ def _texts(names: list[str]) -> Any:
     return np.array([name.encode()[:_LONGEST_NAME] for name in names] or [b""], f"|S{_LONGEST_NAME}")
 
 
-def _addresses(scene: Scene) -> Any:
+def _addresses(scene: PhysicsScene) -> Any:
     return zip(scene.model.jnt_qposadr, scene.model.jnt_dofadr, strict=True)

@@ -32,7 +32,7 @@ _LONE_REACH_M = 0.005
 
 
 @dataclass(frozen=True, eq=False)
-class Taxels:
+class BoundTaxels:
     """n taxels on one body.
 
     Attributes:
@@ -67,7 +67,7 @@ class Taxels:
         )
 
 
-def place(model: Any, module: ModuleBinding, bound: Bound) -> Taxels:
+def place(model: Any, module: ModuleBinding, bound: Bound) -> BoundTaxels:
     """Place the taxels of a module on a body of a compiled scene.
 
     Raises:
@@ -83,7 +83,7 @@ def place(model: Any, module: ModuleBinding, bound: Bound) -> Taxels:
     if module.geometry:
         geometry = read_geometry(bound.file.parent / module.geometry)
         first, last = module.uid
-        rows = np.flatnonzero((geometry.uid >= first) & (geometry.uid <= last) & np.isfinite(geometry.position_m[:, 0]))
+        rows = np.flatnonzero((geometry.frame == module.body) & (geometry.uid >= first) & (geometry.uid <= last))
         rows = rows[np.argsort(geometry.uid[rows])]
         position_m, normal = geometry.position_m[rows], np.nan_to_num(geometry.normal[rows], nan=0.0)
     elif module.arm_board is not None:
@@ -104,10 +104,10 @@ def place(model: Any, module: ModuleBinding, bound: Bound) -> Taxels:
             along = np.cross(module.y, third)
         along /= np.linalg.norm(along)
         axes[row] = along, np.cross(third, along), third
-    return Taxels(module, body, geoms, position_m, axes, _reach(position_m))
+    return BoundTaxels(module, body, geoms, position_m, axes, module.reach_m or _reach(position_m))
 
 
-def add_sensors(spec: Any, taxels: list[Taxels]) -> None:
+def add_sensors(spec: Any, taxels: list[BoundTaxels]) -> None:
     """Add a tactile sensor for each geom of each module to a scene."""
     for number, module in enumerate(taxels):
         step = np.arange(max(_FEWEST_VERTICES, len(module.position_m)))
@@ -131,7 +131,7 @@ def add_sensors(spec: Any, taxels: list[Taxels]) -> None:
             )
 
 
-def place_sensors(model: Any, taxels: list[Taxels]) -> list[list[slice]]:
+def place_sensors(model: Any, taxels: list[BoundTaxels]) -> list[list[slice]]:
     """Write the places of all taxels into the sensors of a compiled scene.
 
     Returns:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware_drivers.virtual.physics.binding import Bound
-from skinware_drivers.virtual.physics.body import Scene
+from skinware_drivers.virtual.physics.body import PhysicsScene
 from skinware_drivers.virtual.physics.services import WorldServices
 from skinware_drivers.virtual.physics.transfer import Transfer
 
@@ -22,7 +22,7 @@ _LONGEST_CATCH_UP_S = 1.0
 _AXES = "xyz"
 
 
-class World:
+class PhysicsWorld:
     """A scene that presses the devices of one emulator.
 
     Args:
@@ -40,7 +40,7 @@ class World:
     """
 
     def __init__(self, bound: Bound, *, seed: int = 0, speed: float = 1.0, has_services: bool = False) -> None:
-        self.scene = Scene(bound)
+        self.scene = PhysicsScene(bound)
         self.origin_ns: int | None = None
         self.left_out_s = 0.0
         self._speed = speed
@@ -79,9 +79,9 @@ class World:
         """Let the physics run to a time of the devices; the first call is at 0 s of the scene."""
         if self.origin_ns is None:
             self.origin_ns = time_ns
-            if self._has_services:
-                self._services = WorldServices(self.scene)
-                self._at_end = weakref.finalize(self, self._services.close)
+        if self._has_services and self._services is None:
+            self._services = WorldServices(self.scene)
+            self._at_end = weakref.finalize(self, self._services.close)
         late_s = self.since_s(time_ns) - self.scene.time_s - _LONGEST_CATCH_UP_S * self._speed
         if late_s > 0:
             self.origin_ns += round(late_s / self._speed * NS_PER_S)
@@ -118,7 +118,7 @@ class World:
         return values
 
     def close(self) -> None:
-        """Take the services away. Idempotent."""
+        """Take the services away until the physics runs on. Idempotent."""
         self._services = None
         if self._at_end is not None:
             self._at_end()

@@ -21,7 +21,7 @@ from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, Arra
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 
 if TYPE_CHECKING:  # needs MuJoCo
-    from skinware_drivers.virtual.physics.world import World as PhysicalWorld
+    from skinware_drivers.virtual.physics.world import PhysicsWorld
 
 WireSource = Callable[[int, int, int, int], Sequence[int]]
 """(board address, triangle, cycle, time in ns) -> the 12 values on the wire, 0-255, instead of felt ones."""
@@ -68,7 +68,7 @@ class PressedSkin:
         physics: the world that presses it; its touch is known only now.
     """
 
-    def __init__(self, options: EmulatedRoboskinOptions, physics: PhysicalWorld | None = None) -> None:
+    def __init__(self, options: EmulatedRoboskinOptions, physics: PhysicsWorld | None = None) -> None:
         self.version: int = 0
         self.physics = physics
         self._options = options

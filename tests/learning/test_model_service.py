@@ -1,0 +1,106 @@
+"""A model as a service: it sees the newest window, and its failures cost nobody else anything."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from skinware import DriverReader, DriverWriter, ServiceReader, Status
+from skinware.errors import ConfigurationError, MissingExtra, StructureError
+from skinware.learning.model_service import ModelService, onnx_model
+from skinware.realtime import now_ns
+from skinware_drivers.testing.waiting import wait_until
+from tests.learning.test_live import hand, publish
+from tests.tactile.skins import placed
+
+Values = npt.NDArray[np.float32]
+
+
+def sums(values: Values, position: Values) -> dict[str, npt.NDArray[np.float32]]:
+    """The sum of each sample; it does not like more than 100."""
+    if values.max() > 100:
+        raise ValueError("too much")
+    return {"sum": values.sum(axis=1), "places": np.nan_to_num(position[:, 0])}
+
+
+def test_its_output_is_that_of_the_newest_window() -> None:
+    geometry = placed(np.column_stack([np.arange(15) * 0.01, np.zeros(15), np.zeros(15)]))
+    with DriverWriter("hand", hand().placed(geometry), rate_hz=50) as writer:
+        publish(writer, 1, now_ns())
+        with (
+            ModelService(sums, "hand", window=2) as service,
+            DriverReader("hand") as hands,
+            ServiceReader("model") as reader,
+        ):
+            service.take(hands.read())
+            assert reader.latest() is None  # the window is not full
+            begin_ns = now_ns()
+            publish(writer, 2, begin_ns)
+            service.take(hands.read())
+            sample = reader.read()
+            assert sample.column("sum").tolist() == [15.0, 30.0]
+            assert np.allclose(sample.column("places"), np.arange(15) * 0.01)
+            assert sample.acquired_ns == begin_ns
+            assert 0 <= sample.column("latency_ms")[0] <= (now_ns() - begin_ns) / 1e6
+            assert (sample.column("failed")[0], sample.column("failures")[0]) == (0, 0)
+            publish(writer, 3, now_ns(), Status.STALE)
+            service.take(hands.read())
+            assert reader.read().column("sum").tolist() == [30.0, 0.0]
+
+
+def test_its_failures_are_counted_and_the_output_before_stays(caplog: pytest.LogCaptureFixture) -> None:
+    outputs = iter([np.zeros(2), np.ones(2), np.array([np.nan, 0.0]), np.zeros(3), np.full(2, 5.0)])
+    with DriverWriter("hand", hand(), rate_hz=50) as writer:
+        publish(writer, 1, now_ns())
+        model = ModelService(lambda values, position: next(outputs), "hand", name="odd")
+        with model as service, DriverReader("hand") as hands, ServiceReader("odd") as reader:
+            seen = []
+            for _ in range(5):  # the last one raises: there are no more outputs
+                publish(writer, 1, now_ns())
+                service.take(hands.read())
+                sample = reader.read()
+                seen.append((sample.column("output").tolist(), int(sample.column("failed")[0])))
+            assert seen == [([1, 1], 0), ([1, 1], 1), ([1, 1], 1), ([5, 5], 0), ([5, 5], 1)]
+            assert sample.column("failures")[0] == 3
+    assert caplog.text.count("the model failed; its service goes on") == 1
+    caplog.clear()
+
+
+def test_it_runs_beside_a_driver_that_comes_back() -> None:
+    stop = threading.Event()
+    with DriverWriter("hand", hand(), rate_hz=50) as writer:
+        publish(writer, 1, now_ns())
+        service = ModelService(sums, "hand")
+        thread = threading.Thread(target=service.run, args=(stop.is_set,))
+        thread.start()
+        with ServiceReader("model", timeout_s=60) as reader:
+            assert reader.read(timeout_s=60).column("sum").tolist() == [15.0]
+            writer.close()
+            with DriverWriter("hand", hand(), rate_hz=50) as again:
+                publish(again, 3, now_ns())
+                wait_until(lambda: reader.read().column("sum").tolist() == [45.0])
+        stop.set()
+        thread.join()
+        service.close()
+
+
+def test_a_model_that_cannot_run_is_refused_at_once(tmp_path: Path) -> None:
+    with DriverWriter("hand", hand(), rate_hz=50) as writer:
+        publish(writer, 1, now_ns())
+        with pytest.raises(ConfigurationError, match=r"the model fails with zeros: .*division"):
+            ModelService(lambda values, position: np.array(1 // 0), "hand")
+        with pytest.raises(StructureError, match="force_z"):
+            ModelService(sums, "hand", type_name="force_z")
+    try:
+        import onnxruntime
+    except ImportError:
+        with pytest.raises(MissingExtra, match="pip install onnxruntime"):
+            onnx_model(tmp_path / "model.onnx")
+        return
+    assert onnxruntime
+    with pytest.raises(ConfigurationError, match="no ONNX model"):
+        onnx_model(tmp_path / "model.onnx")

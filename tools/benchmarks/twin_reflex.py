@@ -1,0 +1,108 @@
+"""A reflex on a simulated gripper: from contact in physics to the command that stops it, and what it still presses.
+
+skin-emulate with the scene `gripper` on a pseudo terminal, skin-driver, skin-calm and examples/reflex.py are a process
+each, with real-time priorities where root starts them. The fingers close at random speeds; both moments are times of
+the scene, to a step of 2 ms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from skinware import Namespace
+from skinware.service import ServiceReader
+
+ROOT = Path(__file__).resolve().parents[2]
+PERIOD_MS = 5
+PRIORITY = 20
+SETTLED_S = 8.0
+BINDING = """
+format = "skinware-binding"
+version = 1
+scene = "{scenes}/gripper.xml"
+transfer = {{counts_per_n = 9000, saturation_n = 8.0, crosstalk = 0.2, hysteresis = 0.04, noise = 3.0}}
+module = [
+    {{device = 0, body = "left_finger", {grid}, x = [0, -1, 0], y = [0, 0, -1]}},
+    {{body = "right_finger", {grid}, x = [0, 1, 0], y = [0, 0, -1]}},
+]
+"""
+
+
+def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float], list[float], int]:
+    """Close the gripper again and again; return the latencies, ms, the forces 0.5 s later, N, and the misses."""
+    scenes = ROOT / "skinware_drivers" / "virtual" / "physics" / "scenes"
+    binding, port = folder / "gripper.toml", folder / "port"
+    binding.write_text(BINDING.format(scenes=scenes, grid="rows = 7, columns = 4, pitch_m = [0.005, 0.005]"))
+    world = ("--world", f"mujoco:{binding}")
+    commands = [
+        ("skin-emulate", "--driver", "robotiq_tsf", "--bus", f"pty:{port}", *world),
+        ("skin-driver", "--driver", "robotiq_tsf", "--bus", str(port), "--period-ms", str(PERIOD_MS), "--latency", "0"),
+        ("skin-calm", "robotiq_tsf", "--into", calm),
+        (sys.executable, str(ROOT / "examples" / "reflex.py"), calm, "joints"),
+    ]
+    random, late_ms, pressed_n, missed = np.random.default_rng(seed), [], [], 0
+    with ExitStack() as stack:
+        for number, command in enumerate(commands):
+            output = stack.enter_context((folder / f"log{number}").open("w"))
+            profile = ("chrt", "-f", str(PRIORITY + number)) if os.geteuid() == 0 else ()
+            process = subprocess.Popen((*profile, *command), stdout=output, stderr=subprocess.STDOUT)
+            stack.callback(process.wait, 20)
+            stack.callback(process.send_signal, signal.SIGTERM)
+            time.sleep(2)
+        truth = stack.enter_context(ServiceReader("truth", timeout_s=20))
+        joints = stack.enter_context(ServiceReader("joints", timeout_s=20))
+        joints.call("move", targets={"lift": -0.065, "close": 0.0}, seconds=1.0)
+        time.sleep(SETTLED_S)
+        for _ in range(closings):
+            joints.call("move", targets={"close": 0.0}, seconds=0.3)
+            time.sleep(1.5)
+            asked_s = float(joints.request().column("commanded_s")[0])
+            joints.call("move", targets={"close": 0.025}, seconds=float(random.uniform(0.8, 2.5)))
+            asked_s, touched_s = max(asked_s, float(joints.request().column("commanded_s")[0])), np.nan
+            until = time.monotonic() + 4
+            while time.monotonic() < until and np.isnan(touched_s):
+                touched_s = float(truth.read(timeout_s=5).column("touched_s")[0])
+            time.sleep(0.5)
+            commanded_s = float(joints.request().column("commanded_s")[0])
+            if commanded_s > asked_s:
+                late_ms.append(1e3 * (commanded_s - touched_s))
+                pressed_n.append(float(truth.request().column("force_n")[0]))
+            else:
+                missed += 1
+    return late_ms, pressed_n, missed
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--closings", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    source, calm = (Namespace(f"bench-{os.getpid()}-{name}") for name in ("source", "calm"))
+    os.environ["SKINWARE_NAMESPACE"] = source.name
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            late_ms, pressed_n, missed = run(arguments.closings, arguments.seed, Path(folder), calm.name)
+    finally:
+        for namespace in (source, calm):
+            shutil.rmtree(namespace.path, ignore_errors=True)
+    if late_ms:
+        p50, p99, most = np.percentile(late_ms, [50, 99, 100])
+        text = f"p50 {p50:.0f}, p99 {p99:.0f}, most {most:.0f} ms; it then presses {np.median(pressed_n):.2f} N"
+        print(f"contact to command at {PERIOD_MS} ms a frame: {text}")
+    print(f"{len(late_ms)} closings stopped, {missed} not")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,12 +1,5 @@
 """Follow baselines: what each taxel would read if nothing touched it, while the hardware drifts and contacts last.
 
-::
-
-    baseline = Baseline.of(reader.structure, "pressure")
-    for frame in reader.in_order():
-        calm = baseline.take(frame)
-        print(calm.value[calm.touched])     # 0 = no touch, in the type's unit
-
 One question decides everything: how much of this could be drift? Each taxel has an offset and knows how uncertain it
 is. A value that is above the offset by more than noise and uncertainty explain is a touch. Under a touch the offset is
 predicted from what the patch has in common, and its uncertainty grows by the drift that was measured at rest. A touch
@@ -32,14 +25,11 @@ from skinware.errors import ConfigurationError
 from skinware.native import give_arrays, read_structs
 from skinware.status import Status
 from skinware.structure import Structure
+from skinware.tactile.arrays import Bytes, Flags, Floats, check_state
 from skinware.tactile.rule import FORGET_AFTER_S, SIGNED_TYPES, UNUSABLE, BaselineSettings, resolution_of
 
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
-
 _STRUCTS = read_structs([Path(native.__file__).with_name("baseline.h")])
-_BLOCKS, _SHOWN = 60, 21
-"""Numbers of a taxel that is measured, and bytes of a taxel that is shown."""
+_BLOCKS, _SHOWN = 60, 21  # numbers of a taxel that is measured, and bytes of a taxel that is shown
 _WHERE_NONE = {"minimum_on": math.nan, "maximum_hold_s": math.inf}
 _NO_VALUE, _NO_NOISE = -1, -2
 _LEARNED = (
@@ -55,10 +45,6 @@ for _call in (_begin, _lose_common, _update, _tare):
 _begin.argtypes = _lose_common.argtypes = (ctypes.c_void_p,)
 _tare.argtypes, _tare.restype = (ctypes.c_void_p, ctypes.c_int64), ctypes.c_int64
 _update.argtypes = (ctypes.c_void_p, ctypes.c_int64, *(ctypes.c_void_p,) * 5)
-
-
-def _words_of(name: str) -> int:
-    return ctypes.sizeof(_STRUCTS[name]) // 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +71,7 @@ class Calm:
     baseline: Floats
     uncertainty: Floats
     noise: Floats
-    why: npt.NDArray[np.uint8]
+    why: Bytes
     forced: Flags
     usable: Flags
 
@@ -145,8 +131,8 @@ class Baseline:
             "patch": patches,
             "module": modules,
             "near": near,
-            "patches": np.zeros((n_patches, _words_of("Patch"))),
-            "modules": np.zeros((n_modules, _words_of("Module"))),
+            "patches": np.zeros((n_patches, ctypes.sizeof(_STRUCTS["Patch"]) // 8)),
+            "modules": np.zeros((n_modules, ctypes.sizeof(_STRUCTS["Module"]) // 8)),
         }
         self._arrays = give_arrays(words, n, room, given)
         self._at = ctypes.addressof(words)
@@ -164,11 +150,7 @@ class Baseline:
     ) -> Self:
         """Make one for the sensors of a type, in the order of ``structure.index(type_name)``.
 
-        Args:
-            structure: structure of the driver.
-            type_name: which sensors.
-            settings: as for the constructor.
-            neighbours: as for the constructor.
+        Settings and neighbours are as for the constructor.
 
         Raises:
             StructureError: no such type here.
@@ -214,13 +196,10 @@ class Baseline:
         self._words.is_held = on
 
     def tare(self, patch: int | None = None) -> int:
-        """Take the present values as the rest, touched or not.
+        """Take the present values as the rest, touched or not, of all taxels or of one patch.
 
         A taxel that has no baseline yet begins with the mean and the noise of its last half second. With fewer than
         four values it begins with the noise of rounding; values without steps go on being measured.
-
-        Args:
-            patch: only of this one.
 
         Returns:
             The number of taxels that were tared.
@@ -236,11 +215,7 @@ class Baseline:
         return number
 
     def take(self, frame: DriverSnapshot) -> Calm:
-        """Calm the next frame of the driver.
-
-        Raises:
-            StructureError: it has no such sensors.
-        """
+        """Calm the next frame of the driver; raises StructureError if it has no such sensors."""
         status = frame.status_of(self.type_name)
         before, suspect = self._suspect, (status & Status.SUSPECT) != 0
         self._suspect = suspect
@@ -295,25 +270,15 @@ class Baseline:
         return {name: self._arrays[name].copy() for name in _LEARNED}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]], rows: npt.NDArray[np.integer]) -> int:
-        """Go on with what another baseline had learned, contacts included.
+        """Go on with what another baseline of m taxels had learned, contacts included; return how many are ready now.
 
-        Args:
-            state: what ``state`` returned, of m taxels.
-            rows: (n,) where each taxel stands there; -1: nowhere.
-
-        Returns:
-            The number of taxels that are ready now.
+        (n,) ``rows`` say where each taxel stands there; -1: nowhere.
 
         Raises:
             ConfigurationError: that is no such state.
         """
-        here = rows >= 0
-        m = int(rows.max(initial=-1)) + 1
-        learned = {name: self._arrays[name] for name in _LEARNED}
-        for name, array in learned.items():
-            given = state.get(name)
-            if given is None or given.dtype != array.dtype or given.ndim != 1 or len(given) < m:
-                raise ConfigurationError(f"no state of a baseline: {name} is missing or has a wrong shape or dtype")
+        here, learned = rows >= 0, {name: self._arrays[name] for name in _LEARNED}
+        check_state("a baseline", state, learned, rows)
         here[here] = state["ready"][rows[here]]
         for name in learned:
             here[here] = np.isfinite(state[name][rows[here]])

@@ -11,14 +11,7 @@ import numpy.typing as npt
 
 from skinware.driver_service import DriverReader, DriverWriter
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import (
-    BadServiceFile,
-    Overrun,
-    Paused,
-    ServiceNotFound,
-    ServiceTimeout,
-    StructureChanged,
-)
+from skinware.errors import BadServiceFile, Overrun, Paused, ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.status import PatchState, Status
@@ -28,15 +21,7 @@ _WAIT_S = WAIT_SLICE_NS / NS_PER_S
 
 
 class DriverSource:
-    """Reads a driver that may stop, restart and change.
-
-    Args:
-        name: name of the driver.
-        namespace: where it is.
-
-    Attributes:
-        reader: the reader of the driver; None before it was found.
-    """
+    """Reads a driver that may stop, restart and change; ``reader`` is None before it was found."""
 
     def __init__(self, name: str, namespace: Namespace) -> None:
         self._name, self._namespace = name, namespace
@@ -46,7 +31,6 @@ class DriverSource:
 
     @property
     def alive(self) -> bool:
-        """Whether the driver runs."""
         return self.reader is not None and self.reader.alive
 
     def next_frame(self) -> DriverSnapshot | None:
@@ -69,7 +53,7 @@ class DriverSource:
         return None if frame.stale else frame
 
     def has_changed(self, frame: DriverSnapshot) -> bool:
-        """Return whether a frame has another structure than the frame before it."""
+        """Whether a frame has another structure than the frame before it."""
         before, self._structure = self._structure, frame.structure
         return frame.structure is not before and frame.structure != before
 
@@ -86,16 +70,7 @@ class CalmedDriver:
     """Publishes a driver again, with the output of a chain, and how far that can be trusted.
 
     ``uncertainty`` is in the unit in which values come to the baseline, NaN without one;
-    ``why`` is a :class:`skinware.status.Why`.
-
-    Args:
-        name: name of the driver.
-        into: namespace where it is published.
-        group: group whose members may read it.
-        operations: operations that programs may ask for.
-
-    Attributes:
-        writer: the writer; None before the driver was seen.
+    ``why`` is a :class:`skinware.status.Why`. The writer is None before the driver was seen.
     """
 
     def __init__(

@@ -34,22 +34,16 @@ log: logging.Logger = logging.getLogger("skinware.calm")
 class CalmRequests:
     """Answers the requests of programs: the operations ``tare``, ``hold`` and ``settings``, and ``acquire``.
 
-    Args:
-        driver: name of the driver.
-
-    Attributes:
-        chain: the chain of the driver; None before the driver was seen.
+    The chain of the driver is None before it was seen.
     """
 
     def __init__(self, driver: str) -> None:
         self._driver = driver
         self.chain: Chain | None = None
-        self._waiting: list[tuple[int, Request]] = []
-        """Requests for a frame, each with the time at which it came."""
+        self._waiting: list[tuple[int, Request]] = []  # requests for a frame, each with the time at which it came
 
     @property
     def operations(self) -> dict[str, Callable[..., object]]:
-        """The operations by name."""
         return {"tare": self.tare, "hold": self.hold, "settings": self.settings}
 
     def tare(self, patch: str | None = None, type: str | None = None) -> dict[str, int]:  # noqa: A002 - its users' word

@@ -1,38 +1,12 @@
-"""Run each sensor type of a driver through a chain of stages, which a file lists in their order.
+"""Run each sensor type of a driver through a chain of stages, which a TOML file lists in their order.
 
-The file is TOML; every key of a stage except ``stage`` is optional::
-
-    format = "skinware-chain"
-    version = 1
-
-    [[stage]]
-    stage = "baseline"          # 0 = no touch: see BaselineSettings
-    tau_s = 30.0
-
-    [[stage]]
-    stage = "curve"             # counts to a unit: see skinware.tactile.curves
-    file = "curves.toml"
-
-    [[stage]]
-    stage = "filter"            # lowpass, mean or median
-    types = ["pressure"]        # default: all for which the stage can be made
-    method = "median"
-
-    [[stage]]
-    stage = "scaler"            # each taxel to one range
-
-    [[stage]]
-    stage = "amplifier"         # gain * value ** exponent + offset
-    exponent = 0.5
-
-``thermal`` before a baseline takes off what temperature does: see skinware.tactile.thermal. ``field`` before a baseline
-and ``vector`` behind it are for taxels with three axes: see skinware.tactile.vectors.
+docs/tactile/baselines.md has examples of the file; the keys of a stage are its settings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -44,21 +18,85 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.baseline import Baseline
-from skinware.tactile.baseline_stage import RESTLESS, BaselineStage, BaselineStageSettings
+from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
+from skinware.tactile.baseline import Baseline, Calm
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
-from skinware.tactile.rule import UNUSABLE
-from skinware.tactile.stages import (
-    AmplifierSettings,
-    FilterSettings,
-    ScalerSettings,
-    Signal,
-    Stage,
-    Taxels,
-)
+from skinware.tactile.rule import UNUSABLE, BaselineSettings
+from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
 from skinware.tactile.thermal import ThermalSettings
 from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of
 from skinware.toml_text import TomlText
+
+RESTLESS = (TEMPERATURE, "acceleration_", "angular_rate_")
+"""Beginnings of the names of types that have no rest to go back to."""
+
+
+class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_field="stage", tag="baseline"):
+    """Settings of a baseline as a stage: 0 = no touch; the unit stays.
+
+    Attributes:
+        types: the sensor types that it is for; None: all for which it can be made.
+    """
+
+    types: tuple[str, ...] | None = None
+
+    def stage(self, taxels: Taxels) -> BaselineStage:
+        name, unit = taxels.type.name, taxels.type.unit
+        if name.startswith(RESTLESS):
+            raise ConfigurationError(f"a {name} has no rest to return to")
+        if name == "proximity" and unit == "m":
+            raise ConfigurationError(
+                "a proximity in m falls when something comes near; baselines are for rising values"
+            )
+        given = {field: getattr(self, field) for field in BaselineSettings.__struct_fields__}
+        return BaselineStage(taxels, BaselineSettings(**given))
+
+
+class BaselineStage(Stage):
+    """Takes the baselines of n taxels away.
+
+    Attributes:
+        baseline: the baselines.
+        before: the taxels as they come in.
+        given: (n,) float32, the values of the newest frame as they came in.
+        calm: the same, calmed; None before the first frame.
+    """
+
+    name = "baseline"
+
+    def __init__(self, taxels: Taxels, settings: BaselineSettings) -> None:
+        self.before = taxels
+        before = taxels.type
+        span = before.maximum - before.minimum
+        calmed = replace(before, minimum=-span if taxels.signed else 0.0, maximum=span)
+        super().__init__(replace(taxels, type=calmed, resolution=0.0))
+        self.baseline = Baseline(
+            taxels.module,
+            taxels.patch,
+            settings,
+            resolution=taxels.resolution,
+            signed=taxels.signed,
+            common=taxels.common,
+            limits=(before.minimum, before.maximum),
+        )
+        self.given: Floats = np.full(len(taxels), np.nan, np.float32)
+        self.calm: Calm | None = None
+
+    @property
+    def touched(self) -> Flags:
+        """(n,) bool, which taxels are touched in the newest frame."""
+        return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
+
+    def step(self, signal: Signal) -> None:
+        self.given = signal.values
+        self.calm = calm = self.baseline.update(
+            signal.time_ns, signal.values, signal.usable, jumped=signal.jumped, bears=signal.bears
+        )
+        signal.deviation = signal.values - calm.baseline
+        signal.values = calm.value
+        signal.forced |= calm.forced
+        signal.unknown |= np.isnan(calm.baseline)
+
 
 FORMAT, VERSION = "skinware-chain", 1
 
@@ -81,12 +119,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class ChainSettings:
-    """The settings of a chain.
-
-    Args:
-        stages: settings of its stages, in their order.
-        place: file and line of a stage, for messages.
-    """
+    """The settings of the stages of a chain, in their order; ``place`` gives file and line of a stage, for messages."""
 
     def __init__(
         self, stages: Sequence[AnySettings], place: Callable[[int], str] = lambda number: f"stage {number + 1}"
@@ -96,7 +129,6 @@ class ChainSettings:
 
     @classmethod
     def calm(cls) -> Self:
-        """Return the settings of a baseline and nothing else."""
         return cls([BaselineStageSettings()])
 
     @classmethod
@@ -160,12 +192,16 @@ _WHY_NO_GROUPS: dict[type, str] = {
 
 
 def _groups(settings: AnySettings, taxels: Mapping[str, Taxels], wanted: Iterable[str]) -> list[tuple[str, ...]]:
-    """Return the types that a stage changes together, for each time that it is made."""
+    """The types that a stage changes together, for each time that it is made."""
     if isinstance(settings, FieldSettings | VectorSettings):
         return [names for names in vectors_of(taxels) if set(names) <= set(wanted)]
     if isinstance(settings, ThermalSettings):
         return [(name, TEMPERATURE) for name in wanted if TEMPERATURE in taxels and not name.startswith(RESTLESS)]
     return [(name,) for name in wanted]
+
+
+HEALTH = "health/"
+"""Beginning of the names of arrays of health in a state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,26 +210,28 @@ class ChainState:
 
     Attributes:
         fingerprint: of the values that its baselines saw.
-        arrays: by type, the arrays of :meth:`.Baseline.state`, and ``uid``.
-        health: by type, the arrays of :meth:`.Health.state`, and ``uid``.
+        arrays: ``TYPE/NAME`` of :meth:`.Baseline.state`, ``health/TYPE/NAME`` of :meth:`.Health.state`, and the ``uid``
+            of both.
     """
 
     fingerprint: str
-    arrays: dict[str, dict[str, npt.NDArray[Any]]]
-    health: dict[str, dict[str, npt.NDArray[Any]]] = field(default_factory=dict)
+    arrays: Arrays
+
+    def of(self, chain: Chain, type_name: str, kind: str = "") -> tuple[Arrays, npt.NDArray[np.intp]]:
+        """Return the arrays of a type, none if it has none, and (n,) the row in them of each taxel; -1: nowhere."""
+        found = part_of(self.arrays, f"{kind}{type_name}/")
+        row_of = {one: row for row, one in enumerate(found["uid"].tolist())} if found else {}
+        return found, np.array([row_of.get(one, -1) for one in chain.uid(type_name).tolist()], np.intp)
 
 
 class Chain:
     """All stages of a driver.
 
-    Args:
-        structure: structure of the driver.
-        steps: its stages in their order, each with the types that it is for.
-        taxels: by type, as they come out.
-
     Attributes:
         structure: structure of the output: the same sensors, float32, with the units of the last stages.
         stages: by type.
+        baseline_stages, curve_stages: by type, the first stage that is a baseline, and the last that is a curve.
+        vectors: the types that are axes of vectors, for each stage that shows vectors.
     """
 
     def __init__(
@@ -201,20 +239,28 @@ class Chain:
     ) -> None:
         self._steps = steps
         self.stages = {name: [stage for stage, names in steps if name in names] for name in taxels}
+        self.baseline_stages: dict[str, BaselineStage] = {}
+        self.curve_stages: dict[str, CurveStage] = {}
+        for name, stages in self.stages.items():
+            for stage in stages:
+                if isinstance(stage, BaselineStage):
+                    self.baseline_stages.setdefault(name, stage)
+                elif isinstance(stage, CurveStage):
+                    self.curve_stages[name] = stage
+        self.vectors = [names for stage, names in steps if isinstance(stage, VectorStage)]
         self._before = structure
-        self._suspect: dict[str, npt.NDArray[np.bool_]] = {}
+        self._suspect: dict[str, Flags] = {}
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
         self.structure: Structure = structure.replace(types=types, dtype=np.float32)
 
     def state(self) -> ChainState:
         """Return what its baselines have learned."""
-        found = {
-            name: {"uid": self.structure.sensor_uid[self.structure.index(name)], **baseline.state()}
-            for name, baseline in self.baselines.items()
-        }
-        for name, arrays in found.items():
+        found: Arrays = {}
+        for name, baseline in self.baselines.items():
+            arrays = {"uid": self.uid(name), **baseline.state()}
             for stage in self._own_stages(name):
                 arrays |= {f"{stage.name}.{key}": array for key, array in stage.state().items()}
+            found |= {f"{name}/{key}": array for key, array in arrays.items()}
         return ChainState(self._fingerprint, found)
 
     def _own_stages(self, name: str) -> list[Stage]:
@@ -234,25 +280,20 @@ class Chain:
             return 0
         restored = 0
         for name, baseline in self.baselines.items():
-            if name in state.arrays:
-                learned = state.arrays[name]
-                rows = self.rows_of(name, learned["uid"])
+            learned, rows = state.of(self, name)
+            if learned:
                 restored += baseline.restore(learned, rows)
                 for stage in self._own_stages(name):
-                    begin = f"{stage.name}."
-                    of_stage = {key.removeprefix(begin): learned[key] for key in learned if key.startswith(begin)}
-                    stage.restore(of_stage, rows)
+                    stage.restore(part_of(learned, f"{stage.name}."), rows)
         return restored
 
     def fits(self, state: ChainState) -> bool:
         """Return whether its baselines see the same values as those of a state did."""
         return state.fingerprint == self._fingerprint
 
-    def rows_of(self, type_name: str, uid: npt.NDArray[Any]) -> npt.NDArray[np.intp]:
-        """Return (n,) where each taxel of a type stands among some uids; -1: nowhere."""
-        row_of = {one: row for row, one in enumerate(uid.tolist())}
-        mine = self.structure.sensor_uid[self.structure.index(type_name)]
-        return np.array([row_of.get(one, -1) for one in mine.tolist()], np.intp)
+    def uid(self, type_name: str) -> npt.NDArray[np.uint64]:
+        """Return (n,) uint64, the uids of the taxels of a type."""
+        return self.structure.sensor_uid[self.structure.index(type_name)]
 
     @property
     def _fingerprint(self) -> str:
@@ -266,38 +307,15 @@ class Chain:
         return repr(before)
 
     @property
-    def baseline_stages(self) -> dict[str, BaselineStage]:
-        """By type, the first stage of each that is a baseline."""
-        found: dict[str, BaselineStage] = {}
-        for name, stages in self.stages.items():
-            for stage in stages:
-                if isinstance(stage, BaselineStage):
-                    found.setdefault(name, stage)
-        return found
-
-    @property
-    def curve_stages(self) -> dict[str, CurveStage]:
-        """By type, the last stage of each that is a curve."""
-        return {name: s for name, stages in self.stages.items() for s in stages if isinstance(s, CurveStage)}
-
-    @property
-    def vectors(self) -> list[tuple[str, ...]]:
-        """The types that are axes of vectors, for each stage that shows vectors."""
-        return [names for stage, names in self._steps if isinstance(stage, VectorStage)]
-
-    @property
     def baselines(self) -> dict[str, Baseline]:
         """By type, the first baseline of each."""
         return {name: stage.baseline for name, stage in self.baseline_stages.items()}
 
-    def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: npt.NDArray[np.uint8]) -> None:
-        """Take the next frame through all stages.
+    def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: Bytes) -> None:
+        """Take the next frame of the driver through all stages.
 
-        Args:
-            frame: frame of the driver.
-            values: (n_sensors,) float32, filled with the output.
-            status: (n_sensors,) uint8, filled with the frame's, ``SUSPECT`` where a baseline was moved by force, and
-                ``NEVER_SEEN`` where a stage has no result yet.
+        Fills (n_sensors,) float32 values with the output; and (n_sensors,) uint8 status with that of the frame,
+        ``SUSPECT`` where a baseline was moved by force, and ``NEVER_SEEN`` where a stage has no result yet.
         """
         status[:] = frame.status
         if any(stage.table.warms for stage in self.curve_stages.values()):
@@ -319,7 +337,7 @@ class Chain:
             of_type = status[index] | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
             status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
 
-    def explain(self, uncertainty: npt.NDArray[np.float32], why: npt.NDArray[np.uint8]) -> None:
+    def explain(self, uncertainty: Floats, why: Bytes) -> None:
         """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""
         for name, stage in self.baseline_stages.items():
             if stage.calm is not None:

@@ -13,25 +13,22 @@ import numpy as np
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.tactile.array_file import Arrays, read_arrays, write_arrays
-from skinware.tactile.chain import Chain, ChainState
+from skinware.tactile.arrays import read_arrays, write_arrays
+from skinware.tactile.chain import HEALTH, Chain, ChainState
 from skinware.tactile.derived_services import CalmHealth
 from skinware.tactile.rule import FORGET_AFTER_S
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
 _VERSION = 2
-_HEALTH = "health/"
 _SAVE_EVERY_NS = 20 * NS_PER_S
 
 
 def save_state(path: Path, state: ChainState) -> None:
     """Write a state; raises OSError if that fails."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {f"{kind}/{name}": array for kind, named in state.arrays.items() for name, array in named.items()}
-    arrays |= {f"{_HEALTH}{kind}/{name}": array for kind, of in state.health.items() for name, array in of.items()}
     head = {"time_s": np.array(time.time()), "fingerprint": np.array(state.fingerprint)}
-    write_arrays(path, _VERSION, head | arrays)
+    write_arrays(path, _VERSION, head | state.arrays)
 
 
 def read_state(path: Path) -> tuple[ChainState | None, str]:
@@ -41,25 +38,20 @@ def read_state(path: Path) -> tuple[ChainState | None, str]:
         The state, or None; and what is missing and why, empty if there is simply no file.
     """
     try:
-        named = read_arrays(path, _VERSION)
-        if named is None:
+        arrays = read_arrays(path, _VERSION)
+        if arrays is None:
             return None, ""
-        age_s, fingerprint = time.time() - float(named.pop("time_s")), str(named.pop("fingerprint"))
+        age_s, fingerprint = time.time() - float(arrays.pop("time_s")), str(arrays.pop("fingerprint"))
     except (ConfigurationError, KeyError, ValueError, TypeError) as error:
         return None, str(error) if isinstance(error, ConfigurationError) else f"{path} cannot be read: {error}"
     if age_s < 0:
         return None, f"{path} is of the future ({-age_s:.0f} s)"
-    arrays: dict[str, Arrays] = {}
-    health: dict[str, Arrays] = {}
-    for key, array in named.items():
-        kind, _, name = key.removeprefix(_HEALTH).partition("/")
-        (health if key.startswith(_HEALTH) else arrays).setdefault(kind, {})[name] = array
-    if any("uid" not in of for of in (*arrays.values(), *health.values())):
+    if any(f"{name.rpartition('/')[0]}/uid" not in arrays for name in arrays):
         return None, f"{path} is no state of a chain"
     if age_s < FORGET_AFTER_S:
-        return ChainState(fingerprint, arrays, health), ""
+        return ChainState(fingerprint, arrays), ""
     why = f"{path} is {age_s:.0f} s old; baselines older than {FORGET_AFTER_S:.0f} s are measured again"
-    return ChainState(fingerprint, {}, health), why
+    return ChainState(fingerprint, {name: arrays[name] for name in arrays if name.startswith(HEALTH)}), why
 
 
 def default_path(namespace: str, name: str) -> Path:
@@ -72,12 +64,7 @@ def default_path(namespace: str, name: str) -> Path:
 
 
 class LearnedState:
-    """Keeps what one chain has learned, and what is known of the health of its sensors.
-
-    Args:
-        path: file that keeps it; None: it is not kept.
-        health: health of the chain; None: there is none.
-    """
+    """Keeps what one chain has learned, and what is known of its health (None: nothing), in a file (None: in none)."""
 
     def __init__(self, path: Path | None, health: CalmHealth | None) -> None:
         self._path, self._health = path, health
@@ -87,16 +74,14 @@ class LearnedState:
     def state(self, chain: Chain) -> ChainState:
         """Return all of it."""
         state = chain.state()
-        return state if self._health is None else replace(state, health=self._health.state())
+        if self._health is None or self._health.judged is None:
+            return state
+        return replace(state, arrays=state.arrays | self._health.judged.state())
 
     def restore(self, chain: Chain, state: ChainState | None = None) -> int:
-        """Let a new chain, which its health follows already, go on with what was learned.
+        """Let a new chain, which its health follows already, go on with a state, or else with that in the file.
 
         A state that does not fit is not used, and a line in the log says why.
-
-        Args:
-            chain: a new one.
-            state: the state; None: the state in the file, if it is of the same sensors.
 
         Returns:
             The number of sensors that have their baselines again.
@@ -107,8 +92,8 @@ class LearnedState:
         try:
             if state is not None:
                 restored = chain.restore(state)
-                if self._health is not None:
-                    self._health.restore(state)
+                if self._health is not None and self._health.judged is not None:
+                    self._health.judged.restore(state)
         except ConfigurationError as error:
             why = f"{self._path}: {error}"
         if why:

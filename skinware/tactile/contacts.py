@@ -1,12 +1,4 @@
-"""Find contacts, touched taxels that hang together, measure them, and follow them from frame to frame.
-
-::
-
-    contacts = Contacts(len(geometry), neighbours(geometry), geometry)
-    for time_ns, value, touched in ...:
-        for contact in contacts.update(value, touched, time_ns):
-            print(contact.id, contact.cop_m, contact.load, contact.taxels)
-"""
+"""Find contacts, touched taxels that hang together, measure them, and follow them from frame to frame."""
 
 from __future__ import annotations
 
@@ -21,6 +13,7 @@ from skinware._columns import Index
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.structure import Structure
+from skinware.tactile.arrays import Bytes, Columns, Doubles, Flags, Floats, Whole, rows_of
 from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
 from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
@@ -31,10 +24,8 @@ MOST = 64
 NO_CONTACT, BEYOND = -1, -2
 """Values of ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
 
-_CLEARLY = 1.5
-"""A contact must have so many times the load of one that is in the list to take its place."""
-_LEAST_SHARE = 0.1
-"""Share of the newest frame in the value of a taxel that is just touched."""
+_CLEARLY = 1.5  # a contact must have so many times the load of one that is in the list to take its place
+_LEAST_SHARE = 0.1  # share of the newest frame in the value of a taxel that is just touched
 _LEAST_SEEN, _MOST_CUT = 0.5, 0.6
 """Least share of a load that must be above the threshold, and largest share of clipped taxels, for an estimate."""
 
@@ -58,8 +49,7 @@ class Contact:
         kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
         provisional: only its last frames speak for it; the baseline has not confirmed it, and its load is 0.
         clipped: number of its taxels that are at the end of their range: load and force are too small.
-        load_whole: estimate of the load with what threshold and clipping cut off, taking it for a bell; NaN if most
-            of it is cut off.
+        load_whole: estimate of the load with what threshold and clipping cut off, as of a bell; NaN if most is cut off.
         uncertainty: how much of the load could be noise or drift, in its unit; NaN if it is not known.
         taxels: (n,) int64, positions among the n taxels, ascending.
     """
@@ -70,52 +60,48 @@ class Contact:
     peak: float
     n: int
     area_m2: float
-    cop_m: npt.NDArray[np.float32]
-    normal: npt.NDArray[np.float32]
+    cop_m: Floats
+    normal: Floats
     force_n: float
     frame: str
-    velocity_m_s: npt.NDArray[np.float32]
+    velocity_m_s: Floats
     kind: ContactKind
     provisional: bool
     clipped: int
     load_whole: float
     uncertainty: float
-    taxels: npt.NDArray[np.int64]
+    taxels: Whole
 
 
 @dataclass(frozen=True, eq=False)
 class ContactSet:
     """All m contacts of one frame, the oldest first; a sequence of :class:`Contact`.
 
+    Each attribute of a contact, but for ``taxels``, has an array (m, ...) here, with the dtype of :data:`COLUMNS`.
+
     Attributes:
-        id: (m,) uint32.
-        age_s, load, peak, area_m2, force_n, load_whole, uncertainty: (m,) float32.
-        n, clipped: (m,) uint32.
-        cop_m, normal, velocity_m_s: (m, 3) float32.
         frame: (m,) int16, index into ``frames``; -1 if it is not known.
-        kind: (m,) uint8, :class:`skinware.tactile.tracking.ContactKind`.
-        provisional: (m,) uint8, 0 or 1.
         contact_of: (n,) int16, the row of the contact of each taxel; -1: none, -2: one without a row.
         beyond: number of contacts without a row.
         frames: names of the coordinate frames.
     """
 
     id: npt.NDArray[np.uint32]
-    age_s: npt.NDArray[np.float32]
-    load: npt.NDArray[np.float32]
-    peak: npt.NDArray[np.float32]
+    age_s: Floats
+    load: Floats
+    peak: Floats
     n: npt.NDArray[np.uint32]
-    area_m2: npt.NDArray[np.float32]
-    cop_m: npt.NDArray[np.float32]
-    normal: npt.NDArray[np.float32]
-    force_n: npt.NDArray[np.float32]
+    area_m2: Floats
+    cop_m: Floats
+    normal: Floats
+    force_n: Floats
     frame: npt.NDArray[np.int16]
-    velocity_m_s: npt.NDArray[np.float32]
-    kind: npt.NDArray[np.uint8]
-    provisional: npt.NDArray[np.uint8]
+    velocity_m_s: Floats
+    kind: Bytes
+    provisional: Bytes
     clipped: npt.NDArray[np.uint32]
-    load_whole: npt.NDArray[np.float32]
-    uncertainty: npt.NDArray[np.float32]
+    load_whole: Floats
+    uncertainty: Floats
     contact_of: npt.NDArray[np.int16]
     beyond: int
     frames: tuple[str, ...]
@@ -131,7 +117,7 @@ class ContactSet:
             kind=ContactKind(self.kind[row]),
             provisional=bool(self.provisional[row]),
             taxels=np.flatnonzero(self.contact_of == row),
-            **{name: getattr(self, name)[row].item() for name in ("id", *_COUNTS, *_SCALARS)},
+            **{name: getattr(self, name)[row].item() for name in _NUMBERS},
             **{name: getattr(self, name)[row] for name in _VECTORS},
         )
 
@@ -150,19 +136,28 @@ class ContactSet:
         return self[int(rows[np.argmax(self.load[rows])])] if len(rows) else None
 
 
-_SCALARS = ("age_s", "load", "peak", "area_m2", "force_n", "load_whole", "uncertainty")
-_COUNTS = ("n", "clipped")
-_VECTORS = ("cop_m", "normal", "velocity_m_s")
-COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "id": ("<u4", ()),
-    **dict.fromkeys(_SCALARS, ("<f4", ())),
-    **dict.fromkeys(_COUNTS, ("<u4", ())),
-    **dict.fromkeys(_VECTORS, ("<f4", (3,))),
-    "frame": ("<i2", ()),
-    "kind": ("u1", ()),
-    "provisional": ("u1", ()),
+_WHOLE = "estimate of the load with what threshold and clipping cut off; NaN: most of it is"
+COLUMNS: Columns = {
+    "id": ("<u4", (), "", "the same as long as the contact lasts; 0: this row is empty"),
+    "age_s": ("<f4", (), "s", "since it began"),
+    "load": ("<f4", (), None, "sum of the values of its taxels"),
+    "peak": ("<f4", (), None, "the largest of them"),
+    "area_m2": ("<f4", (), "m2", "that its taxels stand for"),
+    "force_n": ("<f4", (), "N", "of values in N, or of pressures in Pa by area"),
+    "load_whole": ("<f4", (), None, _WHOLE),
+    "uncertainty": ("<f4", (), None, "how much of the load could be noise or drift; NaN: not known"),
+    "n": ("<u4", (), "", "number of its taxels"),
+    "clipped": ("<u4", (), "", "number of its taxels that are at the end of their range"),
+    "cop_m": ("<f4", (3,), "m", "its centre, in its frame"),
+    "normal": ("<f4", (3,), "", "outwards, of length 1"),
+    "velocity_m_s": ("<f4", (3,), "m/s", "of its centre"),
+    "frame": ("<i2", (), "", "row of frame_name; -1: not known"),
+    "kind": ("u1", (), "", "0: a touch, 1: a hold, 2: sliding"),
+    "provisional": ("u1", (), "", "1: only its last frames speak for it, and its load is 0"),
 }
-"""Dtype and shape, per contact, of each array of a :class:`ContactSet`."""
+"""Dtype, shape, unit (None: that of the values) and meaning, per contact, of each array of a :class:`ContactSet`."""
+_VECTORS = [name for name, (_, shape, *_) in COLUMNS.items() if shape]
+_NUMBERS = [name for name in COLUMNS if name not in ("frame", "kind", "provisional", *_VECTORS)]
 
 
 class Contacts:
@@ -220,11 +215,7 @@ class Contacts:
     ) -> Self:
         """Make one for the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
 
-        Args:
-            structure: structure of the driver.
-            type_name: which sensors.
-            neighbours: default: from their places, as far as they are known.
-            tracking: settings of the tracking.
+        Neighbours are found from the places, as far as they are known, unless they are given.
 
         Raises:
             StructureError: the driver has no such sensors.
@@ -240,11 +231,11 @@ class Contacts:
     def update(
         self,
         value: npt.NDArray[Any],
-        touched: npt.NDArray[np.bool_],
+        touched: Flags,
         time_ns: int,
         *,
-        onset: npt.NDArray[np.bool_] | None = None,
-        clipped: npt.NDArray[np.bool_] | None = None,
+        onset: Flags | None = None,
+        clipped: Flags | None = None,
         uncertainty: npt.NDArray[Any] | None = None,
     ) -> ContactSet:
         """Return the contacts of the next frame.
@@ -266,7 +257,7 @@ class Contacts:
         taxels = np.flatnonzero(touched if onset is None else touched | onset)
         contact_of = np.full(self._n, NO_CONTACT, np.int16)
         if not len(taxels) and self._tracker.rests(time_ns):
-            nothing = {name: np.zeros((0, *shape), dtype) for name, (dtype, shape) in COLUMNS.items()}
+            nothing = {name: np.zeros(shape, dtype) for name, (dtype, shape, *_) in rows_of(COLUMNS, 0).items()}
             return ContactSet(contact_of=contact_of, beyond=0, frames=self.frames, **nothing)
         contact, count = self._components.of(taxels)
         load = value[taxels].astype(np.float64)
@@ -290,18 +281,16 @@ class Contacts:
             cut += np.bincount(contact, clipped[taxels], count)
         unsure = np.full(count, np.nan) if uncertainty is None else np.bincount(contact, uncertainty[taxels], count)
         found |= {"clipped": cut, "uncertainty": unsure, "load_whole": self._whole(found, cut, load)}
-        found |= self._tracker.follow(blobs, time_ns)._asdict()
+        found |= self._tracker.follow(blobs, time_ns)
         order = np.lexsort([found["id"], -found["age_s"]])
         order = order[found["id"][order] > 0]
         row = np.full(count, NO_CONTACT)
         row[order] = np.arange(len(order))
         contact_of[taxels] = row[contact]
-        columns = {name: found[name][order].astype(dtype) for name, (dtype, _) in COLUMNS.items()}
+        columns = {name: found[name][order].astype(dtype) for name, (dtype, *_) in COLUMNS.items()}
         return ContactSet(contact_of=contact_of, beyond=beyond, frames=self.frames, **columns)
 
-    def _measure(
-        self, taxels: npt.NDArray[np.int64], contact: npt.NDArray[np.int64], load: npt.NDArray[np.float64], count: int
-    ) -> dict[str, npt.NDArray[Any]]:
+    def _measure(self, taxels: Whole, contact: Whole, load: Doubles, count: int) -> dict[str, npt.NDArray[Any]]:
         order = np.argsort(contact, kind="stable")
         taxels, contact, load = taxels[order], contact[order], load[order]
         first = np.searchsorted(contact, np.arange(count))  # each contact has at least one taxel
@@ -330,10 +319,8 @@ class Contacts:
             "frame": frame,
         }
 
-    def _whole(
-        self, found: dict[str, npt.NDArray[Any]], cut: npt.NDArray[np.float64], load: npt.NDArray[np.float64]
-    ) -> npt.NDArray[np.float64]:
-        """(count,) the loads of bells of which only what is above the threshold, and below the clipping, was seen."""
+    def _whole(self, found: dict[str, npt.NDArray[Any]], cut: Doubles, load: Doubles) -> Doubles:
+        """(count,) the loads of bells of which only the part above the threshold and below the clipping was seen."""
         if len(load) and (load > 0).any():
             least = float(load[load > 0].min())
             self._least = least if not self._least else self._least + _LEAST_SHARE * (least - self._least)
@@ -347,13 +334,7 @@ class Contacts:
             of_cut = found["n"] * top / np.log(top / self._least)
         return np.where(cut > 0, np.where(share <= _MOST_CUT, of_cut, np.nan), whole)
 
-    def _frame_of(
-        self,
-        taxels: npt.NDArray[np.int64],
-        contact: npt.NDArray[np.int64],
-        load: npt.NDArray[np.float64],
-        peak: npt.NDArray[np.float64],
-    ) -> npt.NDArray[np.int64]:
+    def _frame_of(self, taxels: Whole, contact: Whole, load: Doubles, peak: Doubles) -> Whole:
         """(count,) the frame in which each contact has its largest value; -1 if no place is known."""
         placed = self._frame[taxels] >= 0
         if not placed.all():  # the largest value at a known place
@@ -365,13 +346,7 @@ class Contacts:
         return frame
 
 
-def _largest(
-    taxels: npt.NDArray[np.int64],
-    contact: npt.NDArray[np.int64],
-    load: npt.NDArray[np.float64],
-    count: int,
-    listed: npt.NDArray[np.bool_],
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+def _largest(taxels: Whole, contact: Whole, load: Doubles, count: int, listed: Flags) -> tuple[Whole, Whole, Doubles]:
     """Those of the largest contacts; one that was listed stays unless another is clearly larger."""
     loads = np.bincount(contact, load, count)
     loads *= np.where(np.bincount(contact, listed, count) > 0, _CLEARLY, 1.0)

@@ -1,12 +1,5 @@
 """Publish and read the service ``contacts``: what touches a skin, frame by frame, for programs in any language.
 
-::
-
-    with ContactsReader(namespace="calm", timeout_s=10) as contacts:
-        for sample in contacts:
-            for contact in sample:
-                print(contact.id, contact.load, contact.cop_m, contact.taxels)
-
 Columns of a sample: those of :data:`skinware.tactile.contacts.COLUMNS`, of 64 rows each. ``count`` of them are filled,
 the oldest contact first; in the others ``id``, ``n`` and ``kind`` are 0, ``frame`` is -1 and numbers are NaN.
 ``beyond`` counts the contacts that found no row, ``contact_of`` gives each taxel the row of its contact. Static
@@ -25,6 +18,7 @@ from skinware._columns import Index
 from skinware.memory.ring import ACQUIRED
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
+from skinware.tactile.arrays import Columns, Flags, rows_of
 from skinware.tactile.contacts import COLUMNS, MOST, Contact, Contacts, ContactSet
 from skinware.tactile.onsets import ContactEvent, Events
 from skinware.tactile.source_service import (
@@ -39,35 +33,17 @@ from skinware.tactile.tracking import TrackingSettings
 
 NAME = "contacts"
 
-_ABOUT: dict[str, tuple[str | None, str]] = {
-    "id": ("", "the same as long as the contact lasts; 0: this row is empty"),
-    "age_s": ("s", "since it began"),
-    "load": (None, "sum of the values of its taxels"),
-    "peak": (None, "the largest of them"),
-    "area_m2": ("m2", "that its taxels stand for"),
-    "force_n": ("N", "of values in N, or of pressures in Pa by area"),
-    "n": ("", "number of its taxels"),
-    "cop_m": ("m", "its centre, in its frame"),
-    "normal": ("", "outwards, of length 1"),
-    "velocity_m_s": ("m/s", "of its centre"),
-    "frame": ("", "row of frame_name; -1: not known"),
-    "kind": ("", "0: a touch, 1: a hold, 2: sliding"),
-    "provisional": ("", "1: only its last frames speak for it, and its load is 0"),
-    "clipped": ("", "number of its taxels that are at the end of their range"),
-    "load_whole": (None, "estimate of the load with what threshold and clipping cut off; NaN: most of it is"),
-    "uncertainty": (None, "how much of the load could be noise or drift; NaN: not known"),
-    "count": ("", "number of rows that are filled"),
-    "beyond": ("", "contacts for which there was no row"),
-    "contact_of": ("", "row of the contact of each taxel; -1: none, -2: one for which there was no row"),
-}
+
+def _columns_of(source: Source) -> Columns:
+    text = "row of the contact of each taxel; -1: none, -2: one for which there was no row"
+    return rows_of(COLUMNS, MOST) | {
+        "count": ("<u4", (1,), "", "number of rows that are filled"),
+        "beyond": ("<u4", (1,), "", "contacts for which there was no row"),
+        "contact_of": ("<i2", source.uid.shape, "", text),
+    }
 
 
-def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
-    forms = {name: (dtype, (MOST, *shape)) for name, (dtype, shape) in COLUMNS.items()}
-    return forms | {"count": ("<u4", (1,)), "beyond": ("<u4", (1,)), "contact_of": ("<i2", source.uid.shape)}
-
-
-_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "uid"), _ABOUT, _columns_of)
+_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "uid"), _columns_of)
 
 
 class ContactsSample(SourceSample):
@@ -97,10 +73,6 @@ class ContactsSample(SourceSample):
 class ContactsReader(SourceReader[ContactsSample]):
     """Reads the service ``contacts``: a :class:`skinware.service.ServiceReader` whose samples are contacts.
 
-    Args:
-        name: of the service.
-        namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
-
     Raises:
         BadServiceFile: the service is of another kind.
     """
@@ -111,8 +83,7 @@ class ContactsReader(SourceReader[ContactsSample]):
     def events(self, *, timeout_s: float | None = None) -> Iterator[ContactEvent]:
         """Iterate over onsets, confirmations, withdrawals and ends of contacts, as they come.
 
-        Args:
-            timeout_s: as for :meth:`skinware.service.ServiceReader.in_order`, which also lists the errors.
+        Times out, and raises, as :meth:`skinware.service.ServiceReader.in_order`.
         """
         events = Events()
         for sample in self.in_order(timeout_s=timeout_s):
@@ -151,8 +122,8 @@ class ContactsReader(SourceReader[ContactsSample]):
 class More(TypedDict, total=False):
     """Arguments of :meth:`.Contacts.update` that may be left out."""
 
-    onset: npt.NDArray[np.bool_] | None
-    clipped: npt.NDArray[np.bool_] | None
+    onset: Flags | None
+    clipped: Flags | None
     uncertainty: npt.NDArray[Any] | None
 
 
@@ -163,16 +134,9 @@ class ContactsWriter(SourceWriter):
         structure: of the driver.
         type_name: which sensors.
         driver: its name, for readers.
-        neighbours: (n, k) int, as for :class:`skinware.tactile.contacts.Contacts`; default: from the places that the
-            structure has.
-        tracking: settings of the tracking.
+        neighbours, tracking: as for :meth:`.Contacts.of`, which also lists the errors.
         name: of the service.
-        options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`, which also lists
-            the errors.
-
-    Raises:
-        StructureError: the driver has no such sensors.
-        ConfigurationError: the neighbours are not of these sensors.
+        options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`.
     """
 
     form = _FORM
@@ -193,20 +157,11 @@ class ContactsWriter(SourceWriter):
         source = _source(structure, type_name, driver, self._contacts)
         super().__init__(source, name, f"contacts of {driver or 'a skin'}, {type_name}", **options)
 
-    def publish(
-        self, value: npt.NDArray[Any], touched: npt.NDArray[np.bool_], acquired_ns: int, **more: Unpack[More]
-    ) -> ContactSet:
+    def publish(self, value: npt.NDArray[Any], touched: Flags, acquired_ns: int, **more: Unpack[More]) -> ContactSet:
         """Find the contacts of the next frame, and publish them.
 
-        Args:
-            value: (n,) calmed values of the n sensors; 0 = no touch.
-            touched: (n,) bool.
-            acquired_ns: of the frame, CLOCK_MONOTONIC ns.
-            more: onset, clipped and uncertainty, as for :meth:`.Contacts.update`.
-
-        Raises:
-            ConfigurationError: not of these sensors.
-            Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
+        Arguments as of :meth:`.Contacts.update`; raises ConfigurationError as that, and as
+        :meth:`skinware.service.ServiceWriter.begin`.
         """
         found = self._contacts.update(value, touched, acquired_ns, **more)
         columns = self._service.begin()

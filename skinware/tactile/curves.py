@@ -1,25 +1,7 @@
 """Read and apply force curves, which give values a unit of force or pressure, per type or per taxel.
 
-The file is TOML, keyed like a geometry::
-
-    format = "skinware-curves"
-    version = 1
-
-    [[curve]]
-    type = "pressure"
-    uid = [0x70500, 0x70501]    # default: all of the type that no other curve names
-    from_unit = "counts"
-    unit = "Pa"
-    x = [0.0, 12.0, 40.0, 180.0]        # rising, at most 8
-    y = [0.0, 900.0, 4500.0, 60000.0]   # not falling; beyond its ends a curve is level
-    hysteresis = 0.08                   # for information
-    play = 9.0                          # a follower with this play counts by lag: rising and falling loads differ
-    lag = 20.0
-    creep_s = 30.0                      # what creeps in this time counts by creep
-    creep = -12.0
-    temperature = -0.9                  # in the unit, for each of from_unit and kelvin above at_c
-    at_c = 25.0
-    error = [40.0, 0.03]                # standard deviation at 0, and its growth with the result
+docs/tactile/baselines.md has an example of their file, which is TOML; the keys of a curve are the attributes of
+:class:`Curve`.
 """
 
 from __future__ import annotations
@@ -37,8 +19,9 @@ import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, Floats
 from skinware.tactile.rule import UNUSABLE
-from skinware.tactile.stages import Floats, Signal, Stage, StageSettings, Taxels
+from skinware.tactile.stages import Signal, Stage, StageSettings, Taxels
 from skinware.toml_text import TomlText
 
 FORMAT, VERSION = "skinware-curves", 1
@@ -99,7 +82,6 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
             raise ValueError("y must not fall from knot to knot")
 
     def scaled(self, gain: float, uid: tuple[int, ...]) -> Curve:
-        """Return the curve of some taxels whose results are larger by a factor."""
         names = ("lag", "creep", "temperature")
         terms = {name: gain * getattr(self, name) for name in names}
         return msgspec.structs.replace(self, y=tuple(gain * y for y in self.y), uid=uid, **terms)
@@ -143,20 +125,12 @@ def read_curves(path: str | Path) -> tuple[Curve, ...]:
 
 
 class CurveTable:
-    """The curves of n taxels of one type.
-
-    Args:
-        curves: all curves; those of other types are ignored.
-        type_name: type of the taxels.
-        uid: (n,) uids of the taxels.
+    """The curves of n taxels of one type, by their uids; curves of other types are ignored.
 
     Attributes:
-        unit: unit of the results.
-        from_unit: unit of the values.
-        minimum: (n,) float32, least result of each.
-        maximum: (n,) float32, largest result of each.
-        remembers: whether results depend on values before.
-        warms: whether results depend on the temperature.
+        unit, from_unit: of the results, and of the values.
+        minimum, maximum: (n,) float32, least and largest result of each.
+        remembers, warms: whether results depend on values before, and on the temperature.
 
     Raises:
         ConfigurationError: a taxel without a curve, or curves of several units.
@@ -197,10 +171,7 @@ class CurveTable:
     def step(self, values: Floats, passed_s: float, temperature_c: float = math.nan) -> Floats:
         """Return (n,) the results for the next (n,) values; 0 stays 0 where the past counts.
 
-        Args:
-            values: the values.
-            passed_s: since those before, s.
-            temperature_c: of the skin; NaN: not known.
+        ``passed_s`` is the time since those before, ``temperature_c`` that of the skin; NaN: not known.
         """
         found = self(values)
         play, weight, creep_s, creep, warmth, at_c, *_ = self._terms
@@ -228,18 +199,12 @@ class CurveTable:
 
 
 class LoadMemory:
-    """Follows the past of n taxels, as far as their force depends on it.
-
-    Args:
-        n: number of taxels.
-    """
+    """Follows the past of n taxels, as far as their force depends on it."""
 
     def __init__(self, n: int) -> None:
         self._follows, self._slow = np.zeros(n), np.zeros(n)
 
-    def step(
-        self, values: npt.NDArray[Any], passed_s: float, play: npt.ArrayLike, creep_s: npt.ArrayLike
-    ) -> npt.NDArray[np.float64]:
+    def step(self, values: npt.NDArray[Any], passed_s: float, play: npt.ArrayLike, creep_s: npt.ArrayLike) -> Doubles:
         """Take the next (n,) values in; return (2, n): how far what follows with play is off, and the slow values."""
         self._follows = np.where(values > 0, np.clip(self._follows, values - play, values + play), 0)
         self._slow += (values - self._slow) * -np.expm1(-passed_s / np.asarray(creep_s))
@@ -256,11 +221,6 @@ class CurveSettings(StageSettings, frozen=True, kw_only=True, tag="curve"):
     file: str
 
     def stage(self, taxels: Taxels) -> CurveStage:
-        """Make the stage for some taxels.
-
-        Raises:
-            ConfigurationError: the file cannot be read, a taxel has no curve, or they are for another unit.
-        """
         table = CurveTable(read_curves(self.file), taxels.type.name, taxels.uid)
         if table.from_unit != taxels.type.unit:
             raise ConfigurationError(f"the curves are for {table.from_unit}, and the values are in {taxels.type.unit}")
@@ -285,7 +245,7 @@ class CurveStage(Stage):
         super().__init__(replace(taxels, type=meant, resolution=0.0))
         self.table = table
         self.temperature_c = math.nan
-        self.error: npt.NDArray[np.float32] = np.full(len(taxels), np.nan, np.float32)
+        self.error: Floats = np.full(len(taxels), np.nan, np.float32)
 
     def step(self, signal: Signal) -> None:
         given = signal.values

@@ -10,7 +10,8 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Generic, Self, TypeVar
+from functools import partial
+from typing import Generic, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,8 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.tactile import motion_service
-from skinware.tactile.chain import Chain, ChainState
+from skinware.tactile.arrays import Bytes, Flags, Floats
+from skinware.tactile.chain import Chain
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
@@ -41,15 +43,10 @@ _HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
 class DerivedService(ABC, Generic[WriterT]):
     """A service beside a calmed driver, computed from its frames.
 
-    Args:
-        name: of the service. If another program has it, the driver's name and a hyphen come before it.
-        driver: name of the driver.
-        into: namespace of the calmed driver.
-        group: group whose members may read it.
+    If another program has a service of this name, the name of the driver and a hyphen come before it.
     """
 
-    subject: str
-    """Its subject, for messages."""
+    subject: str  # for messages
 
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
         self._name, self._driver = name, driver
@@ -75,12 +72,12 @@ class DerivedService(ABC, Generic[WriterT]):
             self._writer.close()
         self._writer = None
 
-    def _open(self, make: Callable[[str], WriterT]) -> None:
+    def _open(self, make: Callable[..., WriterT]) -> None:
         """Make the writer, under the first name that is free; raises NameInUse if none is."""
         try:
-            self._writer = make(self._name)
+            self._writer = make(name=self._name, **self._options)
         except NameInUse:
-            self._writer = make(f"{self._driver}-{self._name}")
+            self._writer = make(name=f"{self._driver}-{self._name}", **self._options)
 
     @contextmanager
     def _or_none(self) -> Iterator[None]:
@@ -95,13 +92,7 @@ class DerivedService(ABC, Generic[WriterT]):
 class Loads:
     """The loads of n taxels of a chain: values of one type, or lengths of vectors of three.
 
-    Args:
-        chain: the chain.
-        names: the types; the contacts are those of the last one.
-
-    Attributes:
-        type_name: sensor type of the contacts.
-        n_sensors: number of all sensors of the chain.
+    Contacts are those of the last type, ``type_name``.
     """
 
     def __init__(self, chain: Chain, names: tuple[str, ...]) -> None:
@@ -120,24 +111,22 @@ class Loads:
         vectors = [names for names in chain.vectors if set(names) <= set(chain.baseline_stages)]
         return cls(chain, vectors[0]) if vectors else None
 
-    def usable(self, status: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
+    def usable(self, status: Bytes) -> Flags:
         """Return (n,) bool, which taxels have values of this frame, of (n_sensors,) status."""
-        usable: npt.NDArray[np.bool_] = (status[self._indexes[0]] & UNUSABLE) == 0
-        for index in self._indexes[1:]:
-            usable &= (status[index] & UNUSABLE) == 0
+        usable: Flags = np.logical_and.reduce([(status[index] & UNUSABLE) == 0 for index in self._indexes])
         return usable
 
-    def values(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def values(self, values: Floats) -> Floats:
         """Return (n,) loads of (n_sensors,) values."""
         return _length([values[index] for index in self._indexes])
 
     @property
-    def touched(self) -> npt.NDArray[np.bool_]:
+    def touched(self) -> Flags:
         """(n,) bool, which taxels are touched in the newest frame."""
-        touched: npt.NDArray[np.bool_] = np.logical_or.reduce([stage.touched for stage in self._stages])
+        touched: Flags = np.logical_or.reduce([stage.touched for stage in self._stages])
         return touched
 
-    def more(self, usable: npt.NDArray[np.bool_], unit: str) -> More:
+    def more(self, usable: Flags, unit: str) -> More:
         """Return onsets, clipped taxels and (in the same unit) uncertainties, as far as they are known."""
         calms = [(stage.given, stage.calm) for stage in self._stages if stage.calm is not None]
         if not calms:
@@ -153,26 +142,17 @@ class Loads:
         }
 
 
-def _length(axes: list[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+def _length(axes: list[Floats]) -> Floats:
     """Return (n,) lengths of vectors, by their axes (n,) each; one axis is its own length, with its sign."""
-    length: npt.NDArray[np.float32] = axes[0] if len(axes) == 1 else np.sqrt(sum(axis**2 for axis in axes))
+    length: Floats = axes[0] if len(axes) == 1 else np.sqrt(sum(axis**2 for axis in axes))
     return length
 
 
 class CalmContacts(DerivedService[ContactsWriter]):
-    """The contacts of one calmed driver.
+    """The contacts of one calmed driver, and (``motion``) the motion of regions if there are any.
 
     They are found in pressures, or else in another type that a touch only raises, or else in the lengths of vectors.
-
-    Args:
-        name, driver, into, group: as for :class:`DerivedService`.
-        regions: regions whose motion is published; None: none.
-        motion: name of the service of their motion.
-        poses: by name of a coordinate frame, (4, 4) its pose on the robot: contacts hang together across its border.
-
-    Attributes:
-        motion: the service of motion; None: there are no regions.
-        count: number of contacts in the newest frame.
+    Poses of coordinate frames on the robot, (4, 4) by name, let contacts hang together across their borders.
     """
 
     subject = "contacts"
@@ -211,21 +191,12 @@ class CalmContacts(DerivedService[ContactsWriter]):
             self._writer.restructure(structure, neighbours=beside)
             return
         super().close()
-        options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
         self._open(
-            lambda name: ContactsWriter(
-                structure, type_name, driver=self._driver, neighbours=beside, name=name, **options
-            )
+            partial(ContactsWriter, structure, type_name, driver=self._driver, neighbours=beside, rate_hz=rate_hz)
         )
 
-    def publish(self, values: npt.NDArray[np.float32], status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
-        """Find the contacts of the next frame, and publish them.
-
-        Args:
-            values: (n_sensors,) output of the chain.
-            status: (n_sensors,) output of the chain; sensors without a value of this frame touch nothing.
-            acquired_ns: of the frame.
-        """
+    def publish(self, values: Floats, status: Bytes, acquired_ns: int) -> None:
+        """Find the contacts in the (n_sensors,) output of the chain, and publish them."""
         if self._writer is None or self._loads is None:
             return
         usable, loads = self._loads.usable(status), self._loads.values(values)
@@ -250,11 +221,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
 
 
 class CalmMotion(DerivedService[MotionWriter]):
-    """The motion of the regions of one calmed driver.
-
-    Attributes:
-        contacts: the service of the contacts that move; None: there is none.
-    """
+    """The motion of the regions of one calmed driver, while there is a service of its contacts."""
 
     subject = "motion"
 
@@ -268,21 +235,10 @@ class CalmMotion(DerivedService[MotionWriter]):
         if self.contacts is None:
             return
         source = self.contacts.source
-        options: ServiceOptions = {**self._options, "rate_hz": rate_hz}
-        self._open(
-            lambda name: MotionWriter(
-                chain.structure,
-                source.type_name,
-                self._regions,
-                source.frames,
-                driver=self._driver,
-                name=name,
-                **options,
-            )
-        )
+        given = chain.structure, source.type_name, self._regions, source.frames
+        self._open(partial(MotionWriter, *given, driver=self._driver, rate_hz=rate_hz))
 
-    def publish(self, contacts: ContactSet, values: npt.NDArray[np.float32], acquired_ns: int) -> None:
-        """Publish the motion of the next frame, from its contacts and (n,) values."""
+    def publish(self, contacts: ContactSet, values: Floats, acquired_ns: int) -> None:
         if self._writer is not None:
             with self._or_none():
                 self._writer.publish(contacts, values, acquired_ns)
@@ -292,6 +248,7 @@ class CalmHealth(DerivedService[HealthWriter]):
     """The health of one calmed driver, for all types that have a baseline and that a touch only raises.
 
     Attributes:
+        judged: the health; None before the driver was seen.
         faulty: number of sensors with a fault.
     """
 
@@ -300,44 +257,30 @@ class CalmHealth(DerivedService[HealthWriter]):
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
         super().__init__(name, driver, into, group)
         self.faulty = 0
-        self._health: ChainHealth | None = None
-        self._status: npt.NDArray[np.uint8] = np.zeros(0, np.uint8)
+        self.judged: ChainHealth | None = None
+        self._status: Bytes = np.zeros(0, np.uint8)
         self._due_ns = 0
 
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
         del rate_hz  # it has a rate of its own
-        self._health, self.faulty = ChainHealth(chain, self._driver), 0
+        self.judged, self.faulty = ChainHealth(chain, self._driver), 0
         self._status = np.zeros(chain.structure.n_sensors, np.uint8)
-        if not self._health:
+        if not self.judged:
             self.close()
         elif self._writer is not None:
             self._writer.restructure(chain.structure)
         else:
-            self._open(lambda name: HealthWriter(chain.structure, self._driver, name=name, **self._options))
+            self._open(partial(HealthWriter, chain.structure, self._driver))
 
-    def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
-        """Return what is known, by type: arrays by name, and ``uid``."""
-        return {} if self._health is None else self._health.state()
-
-    def restore(self, state: ChainState) -> None:
-        """Go on with what was known of the sensors of this chain; as :meth:`.ChainHealth.restore`."""
-        if self._health is not None:
-            self._health.restore(state)
-
-    def step(self, status: npt.NDArray[np.uint8], acquired_ns: int) -> None:
-        """Take in what the chain made of the next frame; mark sensors with a fault as ``UNHEALTHY``.
-
-        Args:
-            status: (n_sensors,) output of the chain, changed in place.
-            acquired_ns: of the frame.
-        """
-        if self._health is None:
+    def step(self, status: Bytes, acquired_ns: int) -> None:
+        """Take in what the chain made of the next frame; mark sensors with a fault in (n_sensors,) status."""
+        if self.judged is None:
             return
-        self._health.update(acquired_ns)
+        self.judged.update(acquired_ns)
         if acquired_ns >= self._due_ns:
             self._due_ns = acquired_ns + _HEALTH_PERIOD_NS
-            reports = self._health.reports()
-            self._status = np.uint8(Status.UNHEALTHY) * self._health.faulty(reports)
+            reports = self.judged.reports()
+            self._status = np.uint8(Status.UNHEALTHY) * self.judged.faulty(reports)
             self.faulty = int(np.count_nonzero(self._status))
             if self._writer is not None:
                 with self._or_none():

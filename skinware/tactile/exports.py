@@ -14,22 +14,15 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
+from skinware.tactile.arrays import Doubles
 from skinware.tactile.contacts import Contact, ContactSet
 
 ICUB_NEWTONS_PER_COUNT = 0.05
 """Force of a taxel and count in the skin manager of the iCub."""
 
-Vector = npt.NDArray[np.float64]
-
 
 class IcubPart(NamedTuple):
-    """The part of a robot that contacts are on, in the numbers of the iCub's own enumerations.
-
-    Attributes:
-        body_part: body part.
-        link: link of the body part.
-        skin_part: skin part.
-    """
+    """The part of a robot that contacts are on: body part, its link and skin part, in the numbers of the iCub."""
 
     body_part: int
     link: int
@@ -37,23 +30,13 @@ class IcubPart(NamedTuple):
 
 
 def icub_contacts(
-    contacts: ContactSet,
-    geometry: Geometry,
-    part: IcubPart,
-    *,
-    newtons_per_load: float | None = ICUB_NEWTONS_PER_COUNT,
+    contacts: ContactSet, geometry: Geometry, part: IcubPart, *, newtons_per_load: float | None = ICUB_NEWTONS_PER_COUNT
 ) -> list[list[Any]]:
     """Return contacts as the skin manager of the iCub sends them, each a list of eight.
 
     ``[[id, body part, link, skin part], centre of pressure, force, moment, geometric centre, normal, taxels,
     pressure]``: vectors of three, in m and N; the moment is 0; pressure is the mean value of the taxels. Unlike there,
-    normals are of length 1, and an id lasts as long as its contact.
-
-    Args:
-        contacts: contacts of one frame.
-        geometry: places of the n taxels.
-        part: their part of the robot.
-        newtons_per_load: force per load where it is not known; None: NaN.
+    normals are of length 1, and an id lasts as long as its contact. ``geometry`` has the places of the n taxels.
 
     Raises:
         ConfigurationError: the places are of another number of taxels.
@@ -80,12 +63,8 @@ def tactile_msgs_contacts(
 ) -> list[dict[str, Any]]:
     """Return contacts with the fields of ``tactile_msgs/TactileContact`` of ROS 2.
 
-    The name is the identity; the torque is that of the force about the origin of the frame.
-
-    Args:
-        contacts: contacts of one frame.
-        stamp_ns: time of the frame on the clock of ROS, ns.
-        newtons_per_load: force per load where it is not known; None: NaN.
+    The name is the identity; the torque is that of the force about the origin of the frame. ``stamp_ns`` is the time of
+    the frame on the clock of ROS, ns.
     """
     seconds, rest_ns = divmod(stamp_ns, NS_PER_S)
     messages = []
@@ -103,7 +82,7 @@ def tactile_msgs_contacts(
     return messages
 
 
-def _force_n(contact: Contact, newtons_per_load: float | None) -> Vector:
+def _force_n(contact: Contact, newtons_per_load: float | None) -> Doubles:
     size_n = contact.force_n
     if np.isnan(size_n) and newtons_per_load is not None:
         size_n = newtons_per_load * contact.load

@@ -1,15 +1,5 @@
 """Judge the health of taxels by what they showed in use: stuck, noisy, dead, shorted and other :class:`HealthKind`.
 
-::
-
-    baseline, health = Baseline(module, patch), Health(module, geometry)
-    for time_ns, values in ...:
-        calm = baseline.update(time_ns, values)
-        health.update(time_ns, values, calm)
-    report = health.report()
-    for taxel in np.flatnonzero(report.faulty):
-        print(taxel, report.evidence(taxel, "counts"))
-
 An untouched taxel looks like one that feels nothing, unless both its sides are touched: a thing that presses two taxels
 presses those between them. In a contact that falls off to its edges as a bell does, a taxel in the middle shows at
 least the geometric mean of both sides. That is its *due*. Taxels at a corner lie between no two others: only a wipe
@@ -20,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Self
 
 import msgspec
@@ -31,31 +20,24 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
+from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole, check_state
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_evidence import Dues, Noise, Use
 from skinware.tactile.health_relations import Copies, Dropouts, Twins, lower_median
-from skinware.tactile.health_report import COLUMNS, Flags, Floats, HealthKind, HealthReport
+from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
 from skinware.tactile.neighbours import NONE, Table, neighbours
 from skinware.tactile.rule import resolution_of
 
-_CLEAR = 8.0
-"""Times the noise: a touch this high is no flicker."""
-_HARD = 0.25
-"""Share of what a taxel usually shows at most: less is the rest of a touch, and no other touch."""
-_LEAST_NOISE = 0.5
-"""Steps of the values: no taxel counts as quieter."""
-_FEWEST_AROUND = 3
-"""Neighbours with a known share that a comparison with neighbours needs."""
-_ALIKE = 0.9
-"""Correlation with the touches of another taxel, from which a taxel shows them."""
-_SAME = 0.7
-"""Part of another's touches, from which both are shorted."""
+_CLEAR = 8.0  # times the noise: a touch this high is no flicker
+_HARD = 0.25  # share of what a taxel usually shows at most: less is the rest of a touch, and no other touch
+_LEAST_NOISE = 0.5  # steps of the values: no taxel counts as quieter
+_FEWEST_AROUND = 3  # neighbours with a known share that a comparison with neighbours needs
+_ALIKE = 0.9  # correlation with the touches of another taxel, from which a taxel shows them
+_SAME = 0.7  # part of another's touches, from which both are shorted
 _SQUARES, _OTHER_SQUARES = 0.0003, 0.03
 """Squared difference in parts of the squares: at most that of shorted neighbours, at least that of others."""
-_EXCHANGED = 0.5
-"""Share of what is due to another weak taxel, from which a weak taxel is at its place."""
-_OFTEN = 5.0
-"""Times the dropouts of three quarters of the others."""
+_EXCHANGED = 0.5  # share of what is due to another weak taxel, from which a weak taxel is at its place
+_OFTEN = 5.0  # times the dropouts of three quarters of the others
 _USUAL = 0.1
 """Share of the time: where typical taxels are at an end of the range for longer, that end is where they rest."""
 
@@ -98,24 +80,6 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
                 raise ConfigurationError(f"{name} = {getattr(self, name)}: give a number above 0")
 
 
-@dataclass(frozen=True, eq=False)
-class _Related:
-    """Which of n taxels show what presses others: the kind of fault, those others, and how much of it."""
-
-    kind: npt.NDArray[np.uint8]
-    other: npt.NDArray[np.int32]
-    shown: npt.NDArray[np.float64]
-
-    def note(
-        self,
-        kind: HealthKind,
-        taxels: npt.NDArray[np.int64],
-        others: npt.NDArray[np.int64],
-        shown: npt.NDArray[np.float64],
-    ) -> None:
-        self.kind[taxels], self.other[taxels], self.shown[taxels] = kind, others, shown
-
-
 class Health:
     """Follows the health of the n taxels of one sensor type of one driver, beside their baselines.
 
@@ -154,8 +118,7 @@ class Health:
         self._dues = Dues(geometry, self._neighbours)
         self._dropouts = Dropouts(self._neighbours)
         self._copies, self._twins = Copies(self._module, self._neighbours), Twins(self._neighbours)
-        self._clear = _CLEAR * self._least_noise
-        """A touch above it is clear."""
+        self._clear = _CLEAR * self._least_noise  # a touch above it is clear
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, settings: HealthSettings | None = None) -> Self:
@@ -175,13 +138,7 @@ class Health:
         )
 
     def update(self, time_ns: int, values: npt.ArrayLike, calm: Calm) -> None:
-        """Take the next frame in.
-
-        Args:
-            time_ns: of the frame, as for the baseline.
-            values: (n,) as for the baseline, in the unit of the type.
-            calm: what the baseline made of it.
-        """
+        """Take the next frame in: when it was, its (n,) values, and what the baseline made of them."""
         given = np.asarray(values, np.float32)
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
@@ -216,7 +173,7 @@ class Health:
         rests_at_end = bool(len(known)) and float(np.median(known)) > _USUAL  # hardware that cuts off its own noise
         is_end = self._is_at_end(use.value) & (not rests_at_end)
         stuck = self._stuck(still_s, dead)
-        related = self._related(shown)
+        shows_other, other, other_shown = self._related(shown)
         often = max(settings.dropouts, _OFTEN * float(np.percentile(self._dropouts.count, 75)))
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
@@ -224,11 +181,11 @@ class Health:
             (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
             (HealthKind.DYING, kept < settings.dying * self._median_around(kept, settings.dying)),
             (HealthKind.DEAD, dead),
-            (HealthKind.CROSSTALK, related.kind == HealthKind.CROSSTALK),
+            (HealthKind.CROSSTALK, shows_other == HealthKind.CROSSTALK),
             (HealthKind.NOISY, noise_times > settings.noisy),
             (HealthKind.INTERMITTENT, self._dropouts.count >= often),
-            (HealthKind.SWAPPED, related.kind == HealthKind.SWAPPED),
-            (HealthKind.SHORTED, related.kind == HealthKind.SHORTED),
+            (HealthKind.SWAPPED, shows_other == HealthKind.SWAPPED),
+            (HealthKind.SHORTED, shows_other == HealthKind.SHORTED),
             (HealthKind.STUCK, stuck),
             (HealthKind.CLIPPED, is_end & (stuck | (at_end > settings.clipped))),
         ):
@@ -247,26 +204,30 @@ class Health:
             "recent": np.where(self._dues.hard_touches > 0, self._dues.recent, math.nan),
             "best": np.where(self._dues.best > 0, self._dues.best, math.nan),
             "dropouts": self._dropouts.count,
-            "other": related.other,
-            "other_shown": related.shown,
+            "other": other,
+            "other_shown": other_shown,
         }
-        return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, _) in COLUMNS.items()})
+        return HealthReport(**{name: arrays[name].astype(dtype) for name, (dtype, *_) in COLUMNS.items()})
 
-    def _related(self, shown: npt.NDArray[np.float64]) -> _Related:
-        """Find the taxels whose signals belong to others."""
+    def _related(self, shown: Doubles) -> tuple[Bytes, Whole, Doubles]:
+        """(n,) the fault of taxels that show what presses others, those others, and how much of it they show."""
         settings, n = self.settings, len(shown)
-        related = _Related(np.zeros(n, np.uint8), np.full(n, -1, np.int32), np.full(n, math.nan))
-        copied, other, share = self._copies.found(settings.crosstalk, _ALIKE, 2 * settings.touches)
-        related.note(HealthKind.CROSSTALK, copied, other, share)
+        kind, other, part = np.zeros(n, np.uint8), np.full(n, -1), np.full(n, math.nan)
+
+        def note(of: HealthKind, taxels: Whole, others: Whole, shares: Doubles) -> None:
+            kind[taxels], other[taxels], part[taxels] = of, others, shares
+
+        copied, origin, share = self._copies.found(settings.crosstalk, _ALIKE, 2 * settings.touches)
+        note(HealthKind.CROSSTALK, copied, origin, share)
         same = share >= _SAME
-        related.note(HealthKind.SHORTED, copied[same], other[same], share[same])
+        note(HealthKind.SHORTED, copied[same], origin[same], share[same])
         same &= ~(shown[copied] < settings.weak)  # otherwise it may be at another place
-        related.note(HealthKind.SHORTED, other[same], copied[same], share[same])
+        note(HealthKind.SHORTED, origin[same], copied[same], share[same])
         taxels, others = self._twins.found(_SQUARES, _OTHER_SQUARES, 2 * settings.touches)
-        related.note(HealthKind.SHORTED, taxels, others, np.ones(len(taxels)))
+        note(HealthKind.SHORTED, taxels, others, np.ones(len(taxels)))
         taxels, others = self._dues.exchanges.found(_EXCHANGED, settings.touches)
-        related.note(HealthKind.SWAPPED, taxels, others, np.full(len(taxels), math.nan))
-        return related
+        note(HealthKind.SWAPPED, taxels, others, np.full(len(taxels), math.nan))
+        return kind, other, part
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return what is known, by name: arrays (n, ...), copies; times are how long ago, s."""
@@ -276,20 +237,13 @@ class Health:
         }
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]], rows: npt.NDArray[np.integer]) -> None:
-        """Go on with what was known of taxels before.
-
-        Args:
-            state: what ``state`` returned, of m taxels.
-            rows: (n,) where each taxel stands there; -1: nowhere.
+        """Go on with the state of m taxels, in which (n,) ``rows`` say where each taxel stands; -1: nowhere.
 
         Raises:
             ConfigurationError: that is no such state.
         """
-        here, m = rows >= 0, int(rows.max(initial=-1)) + 1
-        for name, own in self.state().items():
-            given = state.get(name)
-            if given is None or given.dtype != own.dtype or given.shape[1:] != own.shape[1:] or len(given) < m:
-                raise ConfigurationError(f"no state of health: {name} is missing or has a wrong shape or dtype")
+        check_state("health", state, self.state(), rows)
+        here = rows >= 0
         then = rows[here]
         for name, array in self._known().items():
             array[here] = state[name][then]
@@ -314,8 +268,8 @@ class Health:
         at_end: Flags = (values <= least) | (values >= most)
         return at_end
 
-    def _stuck(self, still_s: npt.NDArray[np.float64], dead: Flags) -> Flags:
-        """Find taxels that have not changed for long, although their module was touched, and that nothing holds now."""
+    def _stuck(self, still_s: Doubles, dead: Flags) -> Flags:
+        """Whether taxels have not changed for long, although their module was touched, and nothing holds them now."""
         long = still_s >= self.settings.stuck_s
         found = np.zeros(len(long), bool)
         if not long.any():
@@ -330,7 +284,7 @@ class Health:
         found[rows] = touched_since & ~is_held
         return found
 
-    def _median_around(self, shares: npt.NDArray[np.float64], part: float) -> npt.NDArray[np.float64]:
+    def _median_around(self, shares: Doubles, part: float) -> Doubles:
         """(n,) the median share of the neighbours, where a taxel's own may be less than a part of it; else NaN."""
         around = np.full(len(shares), math.nan)
         most = np.nanmax(shares) if np.isfinite(shares).any() else 0.0

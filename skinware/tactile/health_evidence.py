@@ -9,30 +9,23 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.geometry import Geometry
+from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
 from skinware.tactile.baseline import Calm
-from skinware.tactile.health_relations import APART_S, KEPT, Exchanges, Flags, Floats, Whole
+from skinware.tactile.health_relations import APART_S, KEPT, Exchanges
 from skinware.tactile.neighbours import NONE, Table, pitch_m
 
-_ENOUGH_FRAMES = 100
-"""Frames away from touches that a measurement of noise needs; with fewer it goes on."""
-_GROWTH = 1.2
-"""Times: a noise grows by at most this from one measurement to the next."""
-_MODULE_APART_S = 5.0
-"""Seconds: the same for a module, of which fingers touch one part after the other."""
-_MOST_AT_ONCE = 2048
-"""Touched taxels that are compared in one frame; if there are more, each frame takes another part."""
-_NEAR_PITCHES = 1.3
-"""Pitches: only the nearest ring of neighbours says much about the taxel in the middle."""
+_ENOUGH_FRAMES = 100  # frames away from touches that a measurement of noise needs; with fewer it goes on
+_GROWTH = 1.2  # times: a noise grows by at most this from one measurement to the next
+_MODULE_APART_S = 5.0  # seconds: the same for a module, of which fingers touch one part after the other
+_MOST_AT_ONCE = 2048  # touched taxels that are compared in one frame; if there are more, each frame takes another part
+_NEAR_PITCHES = 1.3  # pitches: only the nearest ring of neighbours says much about the taxel in the middle
 _OPPOSITE_COSINE = -0.9
 """Cosine of the angle from one neighbour to the other: they are opposite beyond some 155 degrees."""
-_SETTLED_TOUCHES = 20
-"""Touches after which a share is known well."""
-_HARD_SQUARE = 0.25
-"""Part of the mean square of what was due: the share of a weaker touch says little."""
+_SETTLED_TOUCHES = 20  # touches after which a share is known well
+_HARD_SQUARE = 0.25  # part of the mean square of what was due: the share of a weaker touch says little
 _BEST_KEPT = 0.9995
 """Part of the best share that a touch leaves: what a taxel showed is forgotten within thousands of touches."""
-_EVEN = 1.4
-"""Times: the farther of two opposite neighbours is at most this much farther than the nearer."""
+_EVEN = 1.4  # times: the farther of two opposite neighbours is at most this much farther than the nearer
 
 
 class Noise:
@@ -40,15 +33,8 @@ class Noise:
 
     A press nearby makes differences too, so a noise grows slowly. A release makes one as large as its load, if the
     baseline was taken under that load (at the start, or by a tare): the taxel falls far below its baseline, which
-    follows it there soon. Differences in between do not count.
-
-    Args:
-        n: number of taxels.
-        measured_s: how long one measurement takes.
-
-    Attributes:
-        deviation: (n,) float32, standard deviation, in the unit of the values; NaN before it is known.
-        at_end: (n,) float32, share of the time at an end of the range; NaN before it is known.
+    follows it there soon. Differences in between do not count. ``deviation`` and ``at_end``, the share of the time at
+    an end of the range, are NaN before they are known.
     """
 
     def __init__(self, n: int, measured_s: float) -> None:
@@ -62,22 +48,13 @@ class Noise:
         self._low: Flags = np.zeros(n, bool)
         self._stays_low: Flags = np.zeros(n, bool)
         """Taxels that were low before the last measurement ended: no baseline follows these."""
-        self._before_low: Floats = np.zeros((3, n), np.float32)
-        """The sums when each taxel fell."""
+        self._before_low: Floats = np.zeros((3, n), np.float32)  # the sums when each taxel fell
 
     def add(self, now_s: float, difference: Floats, at_end: Flags, low: Flags, free: Flags, calm: Calm) -> bool:
-        """Take the next frame in.
+        """Take in the difference from the frame before; return whether a measurement ends with it.
 
-        Args:
-            now_s: its time.
-            difference: (n,) of the values from those of the frame before.
-            at_end: (n,) which are at an end of the range.
-            low: (n,) which are far below their baselines.
-            free: (n,) which are neither touched nor far above their baselines, as at the beginning of a touch.
-            calm: what the baseline made of the frame.
-
-        Returns:
-            Whether a measurement ends with it.
+        Taxels are low far below their baselines; those that are free are neither touched nor far above theirs, as at
+        the beginning of a touch.
         """
         self._note_low(low, calm)
         both = free & self._was_free
@@ -122,18 +99,8 @@ class Noise:
 class Use:
     """Follows when n taxels changed, and how hard they and their modules were touched.
 
-    Args:
-        module: (n,) int, the module of each taxel.
-        touches: touches of a module whose times are kept.
-
-    Attributes:
-        seen: (n,) bool, which taxels have ever had a value.
-        value: (n,) float32, the newest.
-        changed_s: (n,) when it last changed, s.
-        touched: (n,) bool, in the newest frame.
-        peak: (n,) float32, the most that a touch showed.
-        usual: (n,) float32, the same, less of it with each touch.
-        module_touched_s: (n_modules, touches) when each module was last touched, s, the oldest first.
+    ``usual`` is the ``peak`` that a touch showed, less of it with each touch. ``module_touched_s`` has the times of the
+    last touches of each module, (n_modules, touches), the oldest first.
     """
 
     def __init__(self, module: npt.NDArray[np.intp], touches: int) -> None:
@@ -141,7 +108,7 @@ class Use:
         self._module = module
         self.seen: Flags = np.zeros(n, bool)
         self.value: Floats = np.full(n, np.nan, np.float32)
-        self.changed_s: npt.NDArray[np.float64] = np.zeros(n)
+        self.changed_s: Doubles = np.zeros(n)
         self.touched: Flags = np.zeros(n, bool)
         self.peak: Floats = np.zeros(n, np.float32)
         self.usual: Floats = np.zeros(n, np.float32)
@@ -173,17 +140,11 @@ class Use:
 class Dues:
     """Compares n taxels with what is due to them: the geometric mean of both their sides, where both are touched.
 
-    Args:
-        geometry: places of the n taxels; None: not known, and nothing is due.
-        table: (n, k) their neighbours.
-
     Attributes:
-        due: (n,) sum of the squares of what was due in the touches so far; older ones count less.
-        shown: (n,) the same sum of due times shown.
-        touches: (n,) int64, separate touches of both sides.
-        hard_touches: (n,) int64, those to which at least half as much was due as to the mean touch.
-        recent: (n,) the mean share of the last hard touches, each with the same weight.
-        best: (n,) the largest of these means so far; 0 before it is known well.
+        due, shown: sums over the touches so far of due squared, and of due times shown; older ones count less.
+        touches, hard_touches: separate touches of both sides, and those to which much was due.
+        recent: the mean share of the last hard touches, each with the same weight.
+        best: the largest of these means so far; 0 before it is known well.
         exchanges: weak taxels that show what is due to others.
     """
 
@@ -200,14 +161,7 @@ class Dues:
         self._compared_s = np.full(n, -math.inf)
 
     def add(self, now_s: float, above: Floats, calm: Calm, hard: Flags) -> None:
-        """Take the next frame in.
-
-        Args:
-            now_s: its time.
-            above: (n,) its values above the baselines.
-            calm: what the baseline made of it.
-            hard: (n,) taxels that are clearly touched.
-        """
+        """Take the next frame in: its values above the baselines, and which taxels are clearly touched."""
         self._frames += 1
         if self._pairs is None:
             return
@@ -225,14 +179,13 @@ class Dues:
         self._hardest_due[middle[harder]], self._hardest_shown[middle[harder]] = due[harder], shown[harder]
         self.exchanges.note(middle[harder], above)
 
-    def share_shown(self, touches: int) -> npt.NDArray[np.float64]:
-        """Return (n,) the share of its due that each taxel showed; NaN after fewer touches."""
+    def share_shown(self, touches: int) -> Doubles:
+        """(n,) the share of its due that each taxel showed; NaN after fewer touches."""
         known = (self.touches >= touches) & (self.due > 0)
-        share: npt.NDArray[np.float64] = np.where(known, self.shown, math.nan) / np.where(known, self.due, 1)
+        share: Doubles = np.where(known, self.shown, math.nan) / np.where(known, self.due, 1)
         return share
 
     def _end_touches(self, taxels: Whole) -> None:
-        """Add up what some taxels showed in their last touch."""
         due, shown = self._hardest_due[taxels], self._hardest_shown[taxels]
         self.due[taxels] = KEPT * self.due[taxels] + due * due
         self.shown[taxels] = KEPT * self.shown[taxels] + due * shown
@@ -248,12 +201,7 @@ class Dues:
 
 
 class Pairs:
-    """The pairs of taxels on opposite sides of each of n taxels, at about the same distance.
-
-    Args:
-        geometry: places of the n taxels; one whose place is not known lies between none.
-        table: (n, k) int32, which taxels lie beside each other: :func:`skinware.tactile.neighbours.neighbours`.
-    """
+    """The pairs of taxels on opposite sides of each of n taxels, at about the same distance, where places are known."""
 
     def __init__(self, geometry: Geometry, table: Table) -> None:
         away_m = np.linalg.norm(geometry.position_m[table] - geometry.position_m[:, None], axis=2)
@@ -269,14 +217,9 @@ class Pairs:
         self._middle[one[first], column], self._other[one[first], column] = middle[first], other[first]
 
     def around(self, taxels: Whole, touched: Flags) -> tuple[Whole, Whole, Whole]:
-        """Find taxels between two touched ones.
+        """Find the taxels between two touched ones, of which these are one: (m,) those, the one side and the other.
 
-        Args:
-            taxels: the touched ones from which pairs are looked for: all of them, or a part.
-            touched: (n,) bool.
-
-        Returns:
-            (m,) the taxels, (m,) the one side and (m,) the other; a taxel between several pairs is in several rows.
+        A taxel between several pairs is in several rows.
         """
         other = self._other[taxels]
         row, column = np.nonzero(touched[other] & (other != NONE))

@@ -8,66 +8,44 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
 from skinware.tactile.baseline import Calm
 from skinware.tactile.neighbours import NONE, Table
-
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
-Whole = npt.NDArray[np.int64]
 
 KEPT = 0.95
 """Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
 APART_S = 1.0
 """Seconds: touches of a taxel with less time between them count as one."""
-_MOST_EXCHANGED = 64
-"""Weak taxels that are compared with each other."""
-_MOST_COMPARED = 1024
-"""Touched taxels that are compared with their neighbours in one frame."""
-_PLAIN = 24.0
-"""Times the noise: weaker touches do not show whether two taxels are the same."""
-_STEADY = 0.25
-"""Share of a jump: neighbours that change less have not felt it."""
-_STILL_FRAMES = 5
-"""Frames without a large change before a value is lost: noise is large in each."""
-_BACK = 0.2
-"""Share of a jump: the value is back if it differs by less from the one before."""
-_LOST_S = 2.0
-"""Seconds: what lasts longer is no dropout."""
-_FORGET_S = 600.0
-"""Seconds in which half of the dropouts are forgotten."""
-_CHANGE_S = 0.4
-"""Seconds between values that are compared: a slow stroke changes little from one frame to the next."""
-_BELOW = 0.8
-"""Part of its value that another must show, where a taxel seems to be touched alone."""
-_MOST_SHARE = 1.25
-"""Part of the touches of another, beyond which they are not the reason of its own."""
-_MOST_ALONE = 256
-"""Taxels that are compared with all others of their modules."""
+_MOST_EXCHANGED = 64  # weak taxels that are compared with each other
+_MOST_COMPARED = 1024  # touched taxels that are compared with their neighbours in one frame
+_PLAIN = 24.0  # times the noise: weaker touches do not show whether two taxels are the same
+_STEADY = 0.25  # share of a jump: neighbours that change less have not felt it
+_STILL_FRAMES = 5  # frames without a large change before a value is lost: noise is large in each
+_BACK = 0.2  # share of a jump: the value is back if it differs by less from the one before
+_LOST_S = 2.0  # seconds: what lasts longer is no dropout
+_FORGET_S = 600.0  # seconds in which half of the dropouts are forgotten
+_CHANGE_S = 0.4  # seconds between values that are compared: a slow stroke changes little from one frame to the next
+_BELOW = 0.8  # part of its value that another must show, where a taxel seems to be touched alone
+_MOST_SHARE = 1.25  # part of the touches of another, beyond which they are not the reason of its own
+_MOST_ALONE = 256  # taxels that are compared with all others of their modules
 
 
 def lower_median(numbers: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np.floating[Any]], Whole]:
-    """Return (m,) the lower median of the numbers of each row that are not NaN, and (m,) how many these are."""
+    """(m,) the lower median of the numbers of each row that are not NaN, and (m,) how many these are."""
     ordered = np.sort(numbers, axis=1)  # NaN comes last
     count: Whole = (~np.isnan(ordered)).sum(axis=1)
     return ordered[np.arange(len(numbers)), np.maximum(count - 1, 0) // 2], count
 
 
 def _most_around(table: Table, taxels: Whole, changes: Floats) -> Floats:
-    """Return (m,) the largest change of the neighbours of m taxels."""
+    """(m,) the largest change of the neighbours of m taxels."""
     around = table[taxels]
     most: Floats = np.where(around == NONE, np.float32(0), changes[around]).max(axis=1, initial=0)
     return most
 
 
 class Dropouts:
-    """Counts how often each of n taxels loses its value and has it back soon, while its neighbours keep theirs.
-
-    Args:
-        table: (n, k) neighbours.
-
-    Attributes:
-        count: (n,) float32; half of it is forgotten in ten minutes.
-    """
+    """Counts how often each of n taxels loses its value and has it back soon, while its neighbours keep theirs."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -77,16 +55,7 @@ class Dropouts:
         self._before, self._lost = np.zeros((2, len(table)), np.float32)
 
     def add(self, now_s: float, before: Floats, given: Floats, at_end: Flags, calm: Calm, far: Floats) -> None:
-        """Take the next frame in.
-
-        Args:
-            now_s: its time.
-            before: (n,) the values before.
-            given: (n,) its values.
-            at_end: (n,) which of them are at an end of the range.
-            calm: what the baseline made of it.
-            far: (n,) a difference from the baseline that is no noise.
-        """
+        """Take the next frame in; ``far`` from its baseline, a difference is no noise."""
         jump = np.abs(given - before)
         was_still = self._still >= _STILL_FRAMES
         self._still = np.where(jump <= far, self._still + 1, 0)
@@ -108,12 +77,11 @@ class Dropouts:
         self._lost_s[lost], self._before[lost], self._lost[lost] = now_s, before[lost], given[lost]
 
     def forget(self, passed_s: float) -> None:
-        """Let older dropouts count less."""
         self.count *= np.float32(0.5 ** (passed_s / _FORGET_S))
 
 
 class Exchanges:
-    """Compares taxels that show little with what is due to others such: it shows which place a signal comes from."""
+    """Compares taxels that show little with what is due to others such, for the place that a signal comes from."""
 
     def __init__(self, n: int) -> None:
         self.taxels: Whole = np.zeros(0, np.int64)
@@ -140,16 +108,11 @@ class Exchanges:
         self._rank[taxels] = np.arange(count)
 
     def note(self, taxels: Whole, above: Floats) -> None:
-        """Keep what is shown at the hardest moment so far of a touch of these.
-
-        Args:
-            taxels: at their hardest moment.
-            above: (n,) values above the baselines.
-        """
+        """Keep what is shown at the hardest moment so far of a touch of these, by (n,) values above the baselines."""
         rank = self._rank[taxels]
         self._moment[rank[rank >= 0]] = np.maximum(above[self.taxels], 0)
 
-    def end(self, taxels: Whole, due: npt.NDArray[np.float64]) -> None:
+    def end(self, taxels: Whole, due: Doubles) -> None:
         """End the touches of some taxels, to which so much was due."""
         rank = self._rank[taxels]
         rank, due = rank[rank >= 0], due[rank >= 0]
@@ -159,7 +122,7 @@ class Exchanges:
         self._moment[rank] = 0
 
     def found(self, share: float, touches: int) -> tuple[Whole, Whole]:
-        """Return (m,) the taxels that show at least this share of the due of others, and (m,) those others."""
+        """(m,) the taxels that show at least this share of the due of others, and (m,) those others."""
         known = self._touches >= touches
         shares = np.where(known[:, None], self._shown, 0) / np.where(known, self._due, 1)[:, None]
         if not len(shares):
@@ -170,12 +133,7 @@ class Exchanges:
 
 
 class Copies:
-    """Finds taxels that change with another of their module, while their own neighbours do not.
-
-    Args:
-        module: (n,) of each taxel.
-        table: (n, k) neighbours.
-    """
+    """Finds taxels that change with another of their module, while their own neighbours do not."""
 
     def __init__(self, module: npt.NDArray[np.intp], table: Table) -> None:
         self._module, self._table = module, table
@@ -185,14 +143,7 @@ class Copies:
         self._alone: dict[int, _Alone] = {}
 
     def add(self, now_s: float, given: Floats, usable: Flags, clear: float) -> None:
-        """Take the next frame in.
-
-        Args:
-            now_s: its time.
-            given: (n,) its values.
-            usable: (n,) which values are known.
-            clear: a change above it is no noise.
-        """
+        """Take the next frame in; a change above ``clear`` is no noise."""
         if now_s - self._before_s < _CHANGE_S:
             return
         change = given - self._before
@@ -217,16 +168,13 @@ class Copies:
         for taxel in watched[steady & usable[watched]].tolist():
             self._alone[taxel].add(now_s, float(change[taxel]), change, clear)
 
-    def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, npt.NDArray[np.float64]]:
-        """Find taxels that show a part of the touches of others.
+    def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, Doubles]:
+        """Find taxels that show a part of the touches of others: (m,) they, (m,) those others, and (m,) the part.
 
         Args:
             share: the least part.
             alike: the least correlation of both.
             touches: that a taxel must have shown while its neighbours were not touched.
-
-        Returns:
-            (m,) the taxels, (m,) those others, and (m,) the part.
         """
         found = []
         for taxel, alone in self._alone.items():
@@ -261,7 +209,7 @@ class _Alone:
         self._squares += others * others
 
     def nearest(self) -> tuple[int, float, float]:
-        """Return the other that is most alike, the part of it that the taxel shows, and the correlation."""
+        """The other that is most alike, the part of it that the taxel shows, and the correlation."""
         size = np.sqrt(self._squares * self._own)
         alike = np.where(size > 0, self._both, 0) / np.where(size > 0, size, 1)
         best = int(np.argmax(alike))
@@ -269,11 +217,7 @@ class _Alone:
 
 
 class Twins:
-    """Compares each of n taxels with its neighbours: two that always show the same are shorted.
-
-    Args:
-        table: (n, k) neighbours.
-    """
+    """Compares each of n taxels with its neighbours: two that always show the same are shorted."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -282,14 +226,7 @@ class Twins:
         self._compared_s = np.full(len(table), -math.inf)
 
     def add(self, now_s: float, above: Floats, calm: Calm, noise: float) -> None:
-        """Take the next frame in.
-
-        Args:
-            now_s: its time.
-            above: (n,) values above the baselines.
-            calm: what the baseline made of it.
-            noise: standard deviation of the typical taxel.
-        """
+        """Take the next frame in: its values above the baselines, and the noise of the typical taxel."""
         rows = np.flatnonzero(calm.touched & (above > _PLAIN * noise))[:_MOST_COMPARED]
         if not len(rows) or not self._table.shape[1]:
             return
@@ -305,16 +242,13 @@ class Twins:
         self._size[rows] += is_there * (own * own + others * others)
 
     def found(self, same: float, other: float, touches: int) -> tuple[Whole, Whole]:
-        """Find pairs that always show the same.
+        """Find pairs that always show the same: (m,) taxels, and (m,) those with which they are the same.
 
         Args:
             same: two are the same whose squared differences, less those of noise, are less than this part of their
                 squares.
             other: the median of the other neighbours differs by at least this part.
             touches: that are needed.
-
-        Returns:
-            (m,) taxels, and (m,) those with which they are the same.
         """
         known = np.flatnonzero(self.touches >= touches)
         if not len(known) or not self._table.shape[1]:

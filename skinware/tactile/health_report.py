@@ -10,8 +10,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
+from skinware.tactile.arrays import Bytes, Columns, Flags, Floats
 
 
 class HealthKind(enum.IntEnum):
@@ -45,27 +44,12 @@ class HealthKind(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class HealthReport:
-    """The health of n taxels, with the evidence. NaN: not known (yet).
+    """The health of n taxels, with the evidence: arrays (n,), whose meaning is in :data:`COLUMNS`.
 
-    Attributes:
-        kind: (n,) uint8, :class:`HealthKind`.
-        value: (n,) float32, the newest, in the unit of the type.
-        still_s: (n,) float32, for how long it has not changed, s.
-        peak: (n,) float32, the most that a touch showed, in the unit of the type.
-        noise: (n,) float32, standard deviation, in the unit of the type.
-        noise_times: (n,) float32, the same in multiples of the typical taxel's.
-        clipped: (n,) float32, share of the time at an end of the range.
-        touches: (n,) uint32, separate touches of both its sides.
-        shown: (n,) float32, the share of its due that it showed in them.
-        shown_around: (n,) float32, the share that its neighbours showed; only where that is much more.
-        recent: (n,) float32, the mean share of its last 20 touches.
-        best: (n,) float32, the largest of these means so far.
-        dropouts: (n,) float32, how often it lost its value; half of it is forgotten in ten minutes.
-        other: (n,) int32, the taxel whose touches it shows; -1: none.
-        other_shown: (n,) float32, the part of them that it shows.
+    NaN: not known (yet). ``other`` is the number of a taxel among the n.
     """
 
-    kind: npt.NDArray[np.uint8]
+    kind: Bytes
     value: Floats
     still_s: Floats
     peak: Floats
@@ -84,7 +68,7 @@ class HealthReport:
     @classmethod
     def unknown(cls, n: int) -> Self:
         """Make a report of n taxels about which nothing is known."""
-        return cls(**{name: np.full(n, nothing, dtype) for name, (dtype, nothing) in COLUMNS.items()})
+        return cls(**{name: np.full(n, NOTHING[name], dtype) for name, (dtype, *_) in COLUMNS.items()})
 
     @property
     def faulty(self) -> Flags:
@@ -127,13 +111,26 @@ class HealthReport:
         return share if kind is HealthKind.DEAD else ""
 
 
-COLUMNS: dict[str, tuple[str, float]] = {
-    "kind": ("u1", 0),
-    **dict.fromkeys(("value", "still_s", "peak", "noise", "noise_times", "clipped"), ("<f4", math.nan)),
-    "touches": ("<u4", 0),
-    **dict.fromkeys(("shown", "shown_around", "recent", "best"), ("<f4", math.nan)),
-    "dropouts": ("<f4", 0),
-    "other": ("<i4", -1),
-    "other_shown": ("<f4", math.nan),
+COLUMNS: Columns = {
+    "kind": ("u1", (), "", ", ".join(f"{kind:d}: {kind.name.lower().replace('_', ' ')}" for kind in HealthKind)),
+    "value": ("<f4", (), "", "the newest, in the unit of the type"),
+    "still_s": ("<f4", (), "s", "for how long it has not changed"),
+    "peak": ("<f4", (), "", "the most that a touch showed, in the unit of the type"),
+    "noise": ("<f4", (), "", "standard deviation, in the unit of the type"),
+    "noise_times": ("<f4", (), "", "the same in multiples of the typical sensor's"),
+    "clipped": ("<f4", (), "", "share of the time at an end of the range"),
+    "touches": ("<u4", (), "", "separate touches of both its sides"),
+    "shown": ("<f4", (), "", "share of its due that it showed in them"),
+    "shown_around": ("<f4", (), "", "share that its neighbours showed; only where that is much more"),
+    "recent": ("<f4", (), "", "mean share of its last 20 touches"),
+    "best": ("<f4", (), "", "largest of these means so far"),
+    "dropouts": ("<f4", (), "", "how often it lost its value; half of it is forgotten in ten minutes"),
+    "other": ("<i4", (), "", "position of the sensor whose touches it shows; -1: none"),
+    "other_shown": ("<f4", (), "", "part of them that it shows"),
 }
-"""Arrays of a :class:`HealthReport`: dtype of each, and its value where nothing is known."""
+"""Dtype, shape, unit and meaning, per taxel, of each array of a :class:`HealthReport`."""
+NOTHING: dict[str, float] = {name: math.nan if dtype == "<f4" else 0 for name, (dtype, *_) in COLUMNS.items()} | {
+    "dropouts": 0,
+    "other": -1,
+}
+"""The value in each array where nothing is known."""

@@ -1,12 +1,5 @@
 """Judge all sensors of a driver; publish and read it: the service ``health``, once a second, with the reasons.
 
-::
-
-    with HealthReader(namespace="calm", timeout_s=10) as health:
-        report = health.read().report
-        for position in np.flatnonzero(report.faulty):
-            print(health.source.uid[position], report.evidence(position))
-
 Columns of a sample: those of :data:`skinware.tactile.health_report.COLUMNS`, of all sensors of the driver in the order
 of its frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns:
 ``sensor_uid``, ``sensor_type``, and the name of the ``driver``.
@@ -16,17 +9,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Any, Unpack
+from typing import Unpack
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.structure import Structure
-from skinware.tactile.baseline_stage import BaselineStage
-from skinware.tactile.chain import Chain, ChainState
+from skinware.tactile.arrays import Arrays, Flags, rows_of
+from skinware.tactile.chain import HEALTH, BaselineStage, Chain, ChainState
 from skinware.tactile.health import Health
-from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
+from skinware.tactile.health_report import COLUMNS, NOTHING, HealthReport
 from skinware.tactile.source_service import (
     ServiceForm,
     ServiceOptions,
@@ -42,30 +34,7 @@ NAME = "health"
 RATE_HZ = 1.0
 """How often it is published."""
 
-_ABOUT: dict[str, tuple[str | None, str]] = {
-    "kind": ("", ", ".join(f"{kind:d}: {kind.name.lower().replace('_', ' ')}" for kind in HealthKind)),
-    "value": ("", "the newest, in the unit of the type"),
-    "still_s": ("s", "for how long it has not changed"),
-    "peak": ("", "the most that a touch showed, in the unit of the type"),
-    "noise": ("", "standard deviation, in the unit of the type"),
-    "noise_times": ("", "the same in multiples of the typical sensor's"),
-    "clipped": ("", "share of the time at an end of the range"),
-    "touches": ("", "separate touches of both its sides"),
-    "shown": ("", "share of its due that it showed in them"),
-    "shown_around": ("", "share that its neighbours showed; only where that is much more"),
-    "recent": ("", "mean share of its last 20 touches"),
-    "best": ("", "largest of these means so far"),
-    "dropouts": ("", "how often it lost its value; half of it is forgotten in ten minutes"),
-    "other": ("", "position of the sensor whose touches it shows; -1: none"),
-    "other_shown": ("", "part of them that it shows"),
-}
-
-
-def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
-    return {name: (dtype, source.uid.shape) for name, (dtype, _) in COLUMNS.items()}
-
-
-_FORM = ServiceForm(NAME, ("driver", "uid", "type_id"), _ABOUT, _columns_of)
+_FORM = ServiceForm(NAME, ("driver", "uid", "type_id"), lambda source: rows_of(COLUMNS, len(source.uid)))
 
 
 class HealthSample(SourceSample):
@@ -82,10 +51,6 @@ class HealthSample(SourceSample):
 class HealthReader(SourceReader[HealthSample]):
     """Reads the service ``health``: a :class:`skinware.service.ServiceReader` whose samples are reports.
 
-    Args:
-        name: of the service.
-        namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
-
     Raises:
         BadServiceFile: the service is of another kind.
     """
@@ -95,13 +60,9 @@ class HealthReader(SourceReader[HealthSample]):
 
 
 class HealthWriter(SourceWriter):
-    """Publishes the health of the sensors of a driver.
+    """Publishes the health of the sensors of a driver, whose name is for readers.
 
-    Args:
-        structure: of the driver.
-        driver: its name.
-        name: of the service.
-        options: namespace and group, as for :class:`skinware.service.ServiceWriter`, which also lists the errors.
+    Options are namespace and group, as for :class:`skinware.service.ServiceWriter`.
     """
 
     form = _FORM
@@ -115,18 +76,14 @@ class HealthWriter(SourceWriter):
         super().__init__(source, name, f"health of the sensors of {driver}", **given)
 
     def publish(self, reports: Mapping[str, HealthReport], acquired_ns: int) -> None:
-        """Publish the present reports.
-
-        Args:
-            reports: by type of sensors; nothing is known of the others.
-            acquired_ns: of the newest frame, CLOCK_MONOTONIC ns.
+        """Publish the present reports by type of sensors; nothing is known of the others.
 
         Raises:
             StructureError: the driver has no such sensors.
             Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
         """
         columns = self._service.begin()
-        for name, (_, nothing) in COLUMNS.items():
+        for name, nothing in NOTHING.items():
             columns[name][:] = nothing
             for type_name, report in reports.items():
                 index, values = self._structure.index(type_name), getattr(report, name)
@@ -137,22 +94,13 @@ class HealthWriter(SourceWriter):
         self._service.commit(acquired_ns)
 
     def restructure(self, structure: Structure) -> None:
-        """Go on with other sensors, as a new generation.
-
-        Raises:
-            NamespaceError: shared memory is full; the old generation then goes on.
-        """
+        """Go on with other sensors, as a new generation; raises NamespaceError, and then the old one goes on."""
         self._restructure(Source(self.source.driver, uid=structure.sensor_uid, type_id=structure.sensor_type))
         self._structure = structure
 
 
 class ChainHealth:
-    """Follows the health of all types of a chain that have a baseline and that a touch only raises.
-
-    Args:
-        chain: the chain whose values it judges.
-        driver: name of the driver, for messages.
-    """
+    """Follows the health of all types of a chain that have a baseline and that a touch only raises."""
 
     def __init__(self, chain: Chain, driver: str) -> None:
         self._chain = chain
@@ -184,27 +132,22 @@ class ChainHealth:
         """Judge the sensors of each type, in the order of ``structure.index``."""
         return {name: health.report() for name, (_, health) in self._watched.items()}
 
-    def state(self) -> dict[str, dict[str, npt.NDArray[Any]]]:
-        """Return what is known, by type: arrays by name, and ``uid``."""
-        structure = self._chain.structure
-        return {
-            name: {"uid": structure.sensor_uid[structure.index(name)], **health.state()}
-            for name, (_, health) in self._watched.items()
-        }
+    def state(self) -> Arrays:
+        """Return what is known, for the state of the chain."""
+        found: Arrays = {}
+        for name, (_, health) in self._watched.items():
+            arrays = {"uid": self._chain.uid(name), **health.state()}
+            found |= {f"{HEALTH}{name}/{key}": array for key, array in arrays.items()}
+        return found
 
     def restore(self, state: ChainState) -> None:
-        """Go on with what was known of these sensors, if the baselines saw the same values then.
+        """Go on with what was known, if the baselines saw the same values then; raises ConfigurationError."""
+        for name, (_, health) in self._watched.items():
+            known, rows = state.of(self._chain, name, HEALTH)
+            if known and self._chain.fits(state):
+                health.restore(known, rows)
 
-        Raises:
-            ConfigurationError: that is no such state.
-        """
-        if self._chain.fits(state):
-            for name, (_, health) in self._watched.items():
-                if name in state.health:
-                    known = state.health[name]
-                    health.restore(known, self._chain.rows_of(name, known["uid"]))
-
-    def faulty(self, reports: dict[str, HealthReport]) -> npt.NDArray[np.bool_]:
+    def faulty(self, reports: dict[str, HealthReport]) -> Flags:
         """Return (n_sensors,) bool: the sensors of the driver that have a fault in ``reports``."""
         found = np.zeros(self._chain.structure.n_sensors, bool)
         for name, report in reports.items():

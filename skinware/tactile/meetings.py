@@ -7,66 +7,46 @@ from typing import NamedTuple
 import numpy as np
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.tracks import LONGEST_GUESS_S, Floats, Tracks, assign
+from skinware.tactile.arrays import Doubles
+from skinware.tactile.tracks import LONGEST_GUESS_S, Tracks, assign
 
 _STEPS = 4
 _SMALL = 1e-9
-_LOG_PEAK = 0.3
-"""Spread of the logarithm of a peak from frame to frame."""
-_MISFIT = 0.1
-"""Share of the largest value by which a response may differ from a bell."""
+_LOG_PEAK = 0.3  # spread of the logarithm of a peak from frame to frame
+_MISFIT = 0.1  # share of the largest value by which a response may differ from a bell
+_LEAST_VALUE = 1e-3  # share of the expected height: without any load (of a provisional touch) a fit has no solution
 _CLOSE_WIDTHS, _CLOSE_PITCHES, _CLOSE_WAYS = 1.3, 1.2, 1.5
 """Two contacts meet when they come nearer than so many widths, pitches, or shares of their way in a frame."""
-_APART = 1.15
-"""They have met when they are this many times as far apart."""
-_GOES_ON = 3.0
-"""Log of the odds that two contacts kept on their ways, before anything else is known."""
-_WANDER = 0.1
-"""Share of its way by which a contact leaves its lane."""
-_LOG_RATIO = 0.3
-"""Spread of the logarithm of the ratio of two peaks, of contacts wider than a pitch."""
-_MOST_OF_LOAD = 2.0
-"""The most that a comparison of loads counts, as a log of odds."""
-_MOST_PAIRS = 16
-"""Pairs that meet in a frame; more of them are noise."""
+_APART = 1.15  # they have met when they are this many times as far apart
+_GOES_ON = 3.0  # log of the odds that two contacts kept on their ways, before anything else is known
+_WANDER = 0.1  # share of its way by which a contact leaves its lane
+_LOG_RATIO = 0.3  # spread of the logarithm of the ratio of two peaks, of contacts wider than a pitch
+_MOST_OF_LOAD = 2.0  # the most that a comparison of loads counts, as a log of odds
+_MOST_PAIRS = 16  # pairs that meet in a frame; more of them are noise
 _SETS_OFF_M_S, _FROM_PITCHES = 0.2, 1.5
 """m/s, and pitches: a new contact at least so fast that comes from so near where one has just gone is the same."""
 _EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")
 """Fields that belong to an identity, and not to a place."""
 
 
-class Fitted(NamedTuple):
-    """Bells in a blob.
-
-    Attributes:
-        place: (k, 3) m, their centres.
-        variance_m2: (k,) m2, along the skin.
-        peak: (k,) their heights.
-    """
-
-    place: Floats
-    variance_m2: Floats
-    peak: Floats
-
-
 def fit_bells(
-    value: Floats, position: Floats, place: Floats, variance_m2: Floats, peak: Floats, width: Floats
-) -> Fitted:
+    value: Doubles, position: Doubles, place: Doubles, variance_m2: Doubles, peak: Doubles, width: Doubles
+) -> tuple[Doubles, Doubles, Doubles]:
     """Fit k bells of known widths to the values of a blob, by Gauss-Newton steps from where they are expected.
 
     Args:
-        value: (a,) of its taxels.
-        position: (a, 3) m, their places.
-        place: (k, 3) m, expected centres.
-        variance_m2: (k,) m2, of these.
-        peak: (k,) expected heights.
-        width: (k,) m, standard deviation of each bell.
+        value, position: (a,) of its taxels, and (a, 3) m, their places.
+        place, variance_m2: (k, 3) m, expected centres, and (k,) m2, how uncertain these are.
+        peak, width: (k,) expected heights, and (k,) m, the standard deviation of each bell.
+
+    Returns:
+        (k, 3) m, their centres, (k,) m2, the variances of these along the skin, and (k,) their heights.
     """
     k = len(place)
     log_peak = np.log(np.maximum(peak, _SMALL))
     unknown = expected = np.column_stack([place, log_peak])
     prior = np.column_stack([np.tile(1 / variance_m2[:, None], 3), np.full(k, _LOG_PEAK**-2)]).ravel()
-    precision = (_MISFIT * max(value.max(), _SMALL)) ** -2
+    precision = (_MISFIT * max(value.max(), _LEAST_VALUE * peak.max(), _SMALL)) ** -2
     most = np.column_stack([np.tile(width[:, None], 3), np.ones(k)])
     for _ in range(_STEPS):
         away = position[None] - unknown[:, None, :3]
@@ -81,25 +61,20 @@ def fit_bells(
     covariance = np.linalg.inv(information).reshape(k, 4, k, 4)
     of_place = covariance[np.arange(k), :3, np.arange(k), :3]
     along_skin = np.linalg.eigvalsh(of_place)[:, :2].mean(axis=1)  # across it, nothing is seen
-    return Fitted(unknown[:, :3], along_skin, np.exp(unknown[:, 3]))
+    return unknown[:, :3], along_skin, np.exp(unknown[:, 3])
 
 
 class _Meeting(NamedTuple):
     """Two contacts just before they came too near each other."""
 
     began_ns: int
-    apart: Floats
-    """(3,) m from one to the other, across their way."""
-    way: Floats
-    """(3,) direction of their relative motion."""
-    duration_s: float
-    """How long it takes them to pass each other."""
+    apart: Doubles  # (3,) m from one to the other, across their way
+    way: Doubles  # (3,) direction of their relative motion
+    duration_s: float  # how long it takes them to pass each other
     variance_m2: float
     drift_m2_s2: float
-    log_ratio: float
-    """Logarithm of the ratio of their peaks."""
-    pace: Floats
-    """(2, 3) m/s, their velocities."""
+    log_ratio: float  # logarithm of the ratio of their peaks
+    pace: Doubles  # (2, 3) m/s, their velocities
 
 
 class Meetings:
@@ -107,16 +82,13 @@ class Meetings:
 
     That they went on, as their velocities said, is more likely than that they turned round. Against it speak their
     lanes, the part of their distance that lies across their relative motion, and their loads.
-
-    Args:
-        pitch_m: of the taxels, m.
     """
 
     def __init__(self, pitch_m: float) -> None:
         self._pitch_m = pitch_m
         self._open: dict[tuple[int, int], _Meeting] = {}
 
-    def begin(self, tracks: Tracks, expected: Floats, time_ns: int) -> None:
+    def begin(self, tracks: Tracks, expected: Doubles, time_ns: int) -> None:
         """Note the pairs of tracks that come too near each other, on their way to where they are expected."""
         rows = np.flatnonzero((tracks["id"] > 0) & np.isfinite(tracks["place"][:, 0]))
         if len(rows) < 2:
@@ -141,7 +113,7 @@ class Meetings:
         for pair in pairs if len(pairs) <= _MOST_PAIRS else []:
             self._note(tracks[rows[one[pair]]], tracks[rows[other[pair]]], float(close_m[pair]), time_ns)
 
-    def _close_m(self, width: Floats, of_other: Floats) -> Floats:
+    def _close_m(self, width: Doubles, of_other: Doubles) -> Doubles:
         return np.maximum(_CLOSE_WIDTHS * (width + of_other) / 2, _CLOSE_PITCHES * self._pitch_m)
 
     def _note(self, one: np.void, other: np.void, close_m: float, time_ns: int) -> None:
@@ -186,7 +158,7 @@ class Meetings:
                     tracks[name][[one, other]] = tracks[name][[other, one]]
                 tracks["pace"][[one, other]] = meeting.pace  # as if they had exchanged their velocities
 
-    def _turned(self, meeting: _Meeting, apart: Floats, pair: Tracks, time_ns: int) -> bool:
+    def _turned(self, meeting: _Meeting, apart: Doubles, pair: Tracks, time_ns: int) -> bool:
         """Whether the two are rather those that turned round."""
         passed_s = (time_ns - meeting.began_ns) / NS_PER_S
         drift_m2 = meeting.drift_m2_s2 * min(passed_s, meeting.duration_s) ** 2 / 4
@@ -202,13 +174,7 @@ class Meetings:
 
 
 def resume(tracks: Tracks, frames: int, pitch_m: float) -> None:
-    """Give a contact that begins at speed the identity of one that has just gone where it comes from.
-
-    Args:
-        tracks: after the frame; changed in place.
-        frames: in how many a contact must be seen.
-        pitch_m: of the taxels, m.
-    """
+    """Give a contact that begins at speed the identity of one that has just gone where it comes from, in place."""
     new = np.flatnonzero((tracks["home"] >= 0) & (tracks["id"] == 0) & (tracks["frames"] == frames))
     gone = np.flatnonzero((tracks["home"] < 0) & (tracks["id"] > 0))
     if not 0 < len(new) * len(gone) <= _MOST_PAIRS:

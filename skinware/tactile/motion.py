@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import Index
+from skinware.tactile.arrays import Arrays, Columns, Doubles, Floats, rows_of
 from skinware.tactile.contacts import ContactSet
 
 
@@ -34,12 +35,12 @@ class RegionMotion:
     name: str
     load: float
     contacts: int
-    velocity_m_s: npt.NDArray[np.float32]
+    velocity_m_s: Floats
     speed_m_s: float
     frame: str
 
     @property
-    def direction(self) -> npt.NDArray[np.float32]:
+    def direction(self) -> Floats:
         """(3,) of length 1; NaN where nothing moves."""
         length = np.float32(self.speed_m_s if self.speed_m_s > 0 else np.nan)
         return self.velocity_m_s / length
@@ -51,19 +52,18 @@ class MotionSet:
 
     Attributes:
         names: names of the regions.
-        load: (r,) float32.
+        load, speed_m_s: (r,) float32.
         contacts: (r,) uint32.
         velocity_m_s: (r, 3) float32.
-        speed_m_s: (r,) float32.
         frame: (r,) int16, index into ``frames``; -1 if it is not known.
         frames: names of the coordinate frames.
     """
 
     names: tuple[str, ...]
-    load: npt.NDArray[np.float32]
+    load: Floats
     contacts: npt.NDArray[np.uint32]
-    velocity_m_s: npt.NDArray[np.float32]
-    speed_m_s: npt.NDArray[np.float32]
+    velocity_m_s: Floats
+    speed_m_s: Floats
     frame: npt.NDArray[np.int16]
     frames: tuple[str, ...]
 
@@ -86,29 +86,24 @@ class MotionSet:
         return (self[row] for row in range(len(self)))
 
 
-COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
-    "load": ("<f4", ()),
-    "contacts": ("<u4", ()),
-    "velocity_m_s": ("<f4", (3,)),
-    "speed_m_s": ("<f4", ()),
-    "frame": ("<i2", ()),
+COLUMNS: Columns = {
+    "load": ("<f4", (), None, "sum of the values of its touched sensors"),
+    "contacts": ("<u4", (), "", "number of contacts that reach into it"),
+    "velocity_m_s": ("<f4", (3,), "m/s", "mean velocity of its contacts; NaN: none is known"),
+    "speed_m_s": ("<f4", (), "m/s", "length of it"),
+    "frame": ("<i2", (), "", "row of frame_name; -1: not known"),
 }
-"""Dtype and shape, per region, of each array of a :class:`MotionSet`."""
+"""Dtype, shape, unit (None: that of the values) and meaning, per region, of each array of a :class:`MotionSet`."""
 
 
 def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
-    """Return the motion of regions, from the contacts of a frame.
+    """Return the motion of regions, from the contacts of a frame and (n,) calmed values.
 
-    The velocity of a region leaves out contacts in other coordinate frames than the one with most of its load.
-
-    Args:
-        regions: by name, positions among the n taxels: a slice or (m,) int64, as :meth:`.Regions.of` gives them.
-        contacts: contacts of the frame.
-        value: (n,) calmed values, as for :meth:`.Contacts.update`.
+    The velocity of a region leaves out contacts in other coordinate frames than the one with most of its load. Regions
+    are, by name, positions among the n taxels: a slice or (m,) int64, as :meth:`.Regions.of` gives them.
     """
-    found: dict[str, npt.NDArray[Any]] = {
-        name: np.zeros((len(regions), *shape), dtype) for name, (dtype, shape) in COLUMNS.items()
-    }
+    columns = rows_of(COLUMNS, len(regions))
+    found: Arrays = {name: np.zeros(shape, dtype) for name, (dtype, shape, *_) in columns.items()}
     for row, index in enumerate(regions.values()):
         contact = contacts.contact_of[index]
         touched = contact >= 0
@@ -122,7 +117,7 @@ def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDA
     return MotionSet(names=tuple(regions), frames=contacts.frames, **found)
 
 
-def _velocity(contacts: ContactSet, load: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], int]:
+def _velocity(contacts: ContactSet, load: Doubles) -> tuple[Doubles, int]:
     moving = np.flatnonzero((load > 0) & (contacts.frame >= 0))
     if not len(moving):
         return np.full(3, np.nan), -1

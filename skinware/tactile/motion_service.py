@@ -1,12 +1,5 @@
 """Publish and read the service ``motion``: how everything that touches a region of a skin moves, frame by frame.
 
-::
-
-    with MotionReader(namespace="calm", timeout_s=10) as motion:
-        for sample in motion:
-            for region in sample:
-                print(region.name, region.load, region.speed_m_s, region.direction)
-
 Columns of a sample: those of :data:`skinware.tactile.motion.COLUMNS`, a row for each region. Static columns:
 ``region_name``, ``frame_name``, ``driver``, ``type_name`` and ``type_unit``.
 """
@@ -21,6 +14,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
+from skinware.tactile.arrays import rows_of
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.motion import COLUMNS, MotionSet, RegionMotion, motion_of
 from skinware.tactile.regions import Regions
@@ -35,20 +29,9 @@ from skinware.tactile.source_service import (
 
 NAME = "motion"
 
-_ABOUT: dict[str, tuple[str | None, str]] = {
-    "load": (None, "sum of the values of its touched sensors"),
-    "contacts": ("", "number of contacts that reach into it"),
-    "velocity_m_s": ("m/s", "mean velocity of its contacts; NaN: none is known"),
-    "speed_m_s": ("m/s", "length of it"),
-    "frame": ("", "row of frame_name; -1: not known"),
-}
-
-
-def _columns_of(source: Source) -> dict[str, tuple[str, tuple[int, ...]]]:
-    return {name: (dtype, (len(source.regions), *shape)) for name, (dtype, shape) in COLUMNS.items()}
-
-
-_FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "regions"), _ABOUT, _columns_of)
+_FORM = ServiceForm(
+    NAME, ("driver", "type_name", "unit", "frames", "regions"), lambda source: rows_of(COLUMNS, len(source.regions))
+)
 
 
 class MotionSample(SourceSample):
@@ -69,10 +52,6 @@ class MotionSample(SourceSample):
 class MotionReader(SourceReader[MotionSample]):
     """Reads the service ``motion``: a :class:`skinware.service.ServiceReader` whose samples are motion.
 
-    Args:
-        name: of the service.
-        namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
-
     Raises:
         BadServiceFile: the service is of another kind.
     """
@@ -82,17 +61,9 @@ class MotionReader(SourceReader[MotionSample]):
 
 
 class MotionWriter(SourceWriter):
-    """Publishes the motion of a driver's regions.
+    """Publishes the motion of regions of a driver, by its contacts, whose coordinate frames have these names.
 
-    Args:
-        structure: of the driver.
-        type_name: which sensors.
-        regions: regions that may have such sensors.
-        frames: names of the coordinate frames of its contacts.
-        driver: its name, for readers.
-        name: of the service.
-        options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`, which also lists
-            the errors.
+    Other arguments are as for :class:`skinware.tactile.contacts_service.ContactsWriter`.
 
     Raises:
         StructureError: the driver has no such sensors.
@@ -119,15 +90,9 @@ class MotionWriter(SourceWriter):
         super().__init__(source, name, f"motion over regions of {driver or 'a skin'}, {type_name}", **options)
 
     def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:
-        """Publish the motion of the next frame.
+        """Publish the motion of the next frame, by its contacts and (n,) calmed values.
 
-        Args:
-            contacts: of the frame.
-            value: (n,) calmed values of the n sensors.
-            acquired_ns: of the frame, CLOCK_MONOTONIC ns.
-
-        Raises:
-            Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
+        Raises as :meth:`skinware.service.ServiceWriter.begin`.
         """
         found = motion_of(self._index, contacts, value)
         columns = self._service.begin()

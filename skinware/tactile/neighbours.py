@@ -11,16 +11,14 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
+from skinware.tactile.arrays import Doubles, Flags, Whole
 
 NONE = -1
 """Fills up the rows of a table."""
 
-_REACH = 1.8
-"""Pitches within which taxels are neighbours: two rings of a lattice of squares or triangles."""
-_OPPOSITE = -0.2
-"""Scalar product of two normals below which their taxels lie on different sides of a thin part."""
-_MOST_AT_ONE_PLACE = 32
-"""Taxels at one place: files give a place to more of them only where their places are not known."""
+_REACH = 1.8  # pitches within which taxels are neighbours: two rings of a lattice of squares or triangles
+_OPPOSITE = -0.2  # scalar product of two normals below which their taxels lie on different sides of a thin part
+_MOST_AT_ONE_PLACE = 32  # taxels at one place: files give a place to more of them only where their places are not known
 _MOST_CANDIDATES = 10_000_000
 _MOST_CELLS = 1 << 62
 _PITCH_SAMPLE = 128
@@ -101,7 +99,7 @@ def neighbours_of_pairs(pairs: npt.ArrayLike, n: int) -> Table:
     return _table(one[one != other], other[one != other], n)
 
 
-def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
+def pitch_m(geometry: Geometry) -> Doubles:
     """Return (n,) m the pitch of each taxel's frame, the median distance from a place to the nearest other on its side.
 
     NaN where the place is not known, or is the only one of its frame.
@@ -124,7 +122,7 @@ def pitch_m(geometry: Geometry) -> npt.NDArray[np.float64]:
     return pitch
 
 
-def area_m2(geometry: Geometry) -> npt.NDArray[np.float64]:
+def area_m2(geometry: Geometry) -> Doubles:
     """Return (n,) m2 the area of skin that each taxel stands for, an estimate from the pitch of its frame.
 
     A frame counts as a lattice of triangles if enough places have five or more others at the pitch, else as one of
@@ -153,7 +151,7 @@ def area_m2(geometry: Geometry) -> npt.NDArray[np.float64]:
     return area
 
 
-def _placed(geometry: Geometry) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _placed(geometry: Geometry) -> tuple[Whole, Whole]:
     rows = np.flatnonzero(np.isfinite(geometry.position_m).all(axis=1))
     _, frame = np.unique(geometry.frame[rows].astype(str), return_inverse=True)
     if not len(rows):
@@ -165,17 +163,13 @@ def _placed(geometry: Geometry) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.i
     return rows[own], frame[own]
 
 
-def _on_one_side(
-    normal: npt.NDArray[np.float64], one: npt.NDArray[np.int64], other: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _on_one_side(normal: Doubles, one: Whole, other: Whole) -> tuple[Whole, Whole]:
     """The pairs that do not lie on opposite sides of a part, as far as their normals are known."""
     opposite = np.einsum("ij,ij->i", normal[one], normal[other]) < _OPPOSITE
     return one[~opposite], other[~opposite]
 
 
-def _pairs_within_1(
-    frame: npt.NDArray[np.int64], places: npt.NDArray[np.float64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _pairs_within_1(frame: Whole, places: Doubles) -> tuple[Whole, Whole]:
     """All pairs of rows of one frame whose places are at most 1 apart, each pair once.
 
     Places are sorted into cells of side 1. The keys of the cells along z follow each other, so that one search finds
@@ -207,15 +201,14 @@ def _pairs_within_1(
     return one[near], other[near]
 
 
-def _table(one: npt.NDArray[np.int64], other: npt.NDArray[np.int64], n: int) -> Table:
-    """The table of pairs, each given at least once in one direction."""
+def _table(one: Whole, other: Whole, n: int) -> Table:
     pairs = np.sort(np.concatenate([one * n + other, other * n + one]))  # np.unique sorts ten times as long
     pairs = pairs[np.diff(pairs, prepend=-1) > 0]
     row, neighbour = pairs // max(n, 1), pairs % max(n, 1)
     return _filled(row, neighbour, n)
 
 
-def _filled(row: npt.NDArray[np.int64], number: npt.NDArray[np.integer], n: int) -> Table:
+def _filled(row: Whole, number: npt.NDArray[np.integer], n: int) -> Table:
     """A table with numbers in n rows, given row by row."""
     count = np.bincount(row, minlength=n)
     table = np.full((n, int(count.max(initial=0))), NONE, np.int32)
@@ -237,17 +230,15 @@ def checked(table: npt.NDArray[Any], n: int) -> Table:
     return neighbours_of_pairs(np.column_stack([row, table[row, column].astype(np.int64)]), n)
 
 
-Rows = npt.NDArray[np.int64]
-
-
 class Components:
     """Finds the components of touched taxels.
+
+    Touched taxels of one module that have no neighbours at all hang together; without modules, each is alone.
 
     Args:
         n: number of taxels.
         neighbours: (n, k) int, -1 fills its rows; None: not known.
-        module: (n,) int, the module of each taxel: touched taxels of one module that have no neighbours at all hang
-            together. None: each is alone.
+        module: (n,) int, the module of each taxel.
 
     Raises:
         ConfigurationError: the table is not one of n taxels.
@@ -261,11 +252,10 @@ class Components:
         self._module = module if self._is_lonely.any() else None
         self._position = np.full(n + 1, NONE, np.int32)  # among those that are touched; the last one is that of NONE
 
-    def of(self, touched: Rows) -> tuple[Rows, int]:
-        """Return (m,) int64 the component of each of m touched taxels, counted from 0 in their order; and their number.
+    def of(self, touched: Whole) -> tuple[Whole, int]:
+        """Return (m,) int64 the component of each of m taxels, counted from 0 in their order; and their number.
 
-        Args:
-            touched: (m,) int64, taxels in ascending order.
+        ``touched`` is (m,) int64, ascending.
         """
         self._position[touched] = np.arange(len(touched))
         beside = self._position[self._forward[touched]].reshape(-1)
@@ -282,7 +272,7 @@ class Components:
         return number[root], int(is_root.sum())
 
 
-def _roots(count: int, low: Rows, high: Rows) -> Rows:
+def _roots(count: int, low: Whole, high: Whole) -> Whole:
     """(count,) int64: the smallest member of the component of each, for edges from ``low`` to higher numbers."""
     root = np.arange(count)
     while len(low):
@@ -296,15 +286,11 @@ def _roots(count: int, low: Rows, high: Rows) -> Rows:
     return root
 
 
-def without_holes(touched: npt.NDArray[np.bool_], neighbours: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """Return (n,) bool the touched taxels and their holes: taxels most of whose neighbours are among them.
+def without_holes(touched: Flags, neighbours: npt.NDArray[Any]) -> Flags:
+    """Return (n,) bool the touched taxels and their holes: taxels most of whose (n, k) neighbours are among them.
 
     At the edge of a skin taxels have few neighbours. There, the number of such neighbours must be more than half of the
     usual number, or the result would grow along the edge.
-
-    Args:
-        touched: (n,) bool.
-        neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows.
     """
     is_neighbour = neighbours != NONE
     count = is_neighbour.sum(axis=1)

@@ -1,12 +1,4 @@
-"""Find touches within two frames, before a baseline has confirmed them, and turn contacts into events.
-
-::
-
-    with ContactsReader(namespace="calm", timeout_s=10) as contacts:
-        for event in contacts.events():
-            if event.kind is EventKind.ONSET:
-                ...                             # a reflex: 2 frames after the touch, and sometimes for nothing
-"""
+"""Find touches within two frames, before a baseline has confirmed them, and turn contacts into events."""
 
 from __future__ import annotations
 
@@ -15,32 +7,24 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
+from skinware.tactile.arrays import Flags, Floats
 
 if TYPE_CHECKING:
     from skinware.tactile.contacts import Contact, ContactSet
 
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 
-_ABOVE_SIGMA = 5.0
-"""Standard deviations of its noise by which a taxel must be above its baseline."""
-_ENOUGH, _FRAMES = 2, 3
-"""In how many of the last frames."""
-_GONE_S = 0.08
-"""Seconds after which a contact that is missing has ended: longer than its identity is kept."""
+_ABOVE_SIGMA = 5.0  # standard deviations of its noise by which a taxel must be above its baseline
+_ENOUGH, _FRAMES = 2, 3  # in how many of the last frames
+_GONE_S = 0.08  # seconds after which a contact that is missing has ended: longer than its identity is kept
 
 
 class Onsets:
     """Finds which of n taxels have risen beyond their own noise in two of the last three frames.
 
     Nothing is smoothed: a spike of one frame is none, and a touch is found in its second frame, at any rate.
-
-    Args:
-        n: number of taxels.
-        resolution: step of the values, in the unit of the noise; 0 if they have none.
+    ``resolution`` is the step of the values, in the unit of the noise; 0 if they have none.
     """
 
     def __init__(self, n: int, resolution: float = 0.0) -> None:
@@ -50,10 +34,8 @@ class Onsets:
     def update(self, above: Floats, noise: Floats, usable: Flags) -> Flags:
         """Return (n,) bool, which taxels are touched, as far as the newest frames say.
 
-        Args:
-            above: (n,) how far each value is above its baseline, not smoothed.
-            noise: (n,) standard deviation of that, noise and baseline; NaN: not known, so that nothing is found.
-            usable: (n,) bool, which values are of this frame.
+        ``above`` is how far each value is above its baseline, not smoothed, and ``noise`` the standard deviation of
+        that, noise and baseline; NaN: not known, so that nothing is found. ``usable`` values are of this frame.
         """
         is_above = usable & (above > np.maximum(_ABOVE_SIGMA * noise, self._least))
         count = np.sum([is_above, *self._were], axis=0, dtype=np.int8)
@@ -77,13 +59,7 @@ class EventKind(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class ContactEvent:
-    """An event.
-
-    Attributes:
-        kind: what has happened.
-        contact: the contact; at the end, as it was last seen.
-        acquired_ns: of the frame in which that was seen, CLOCK_MONOTONIC ns.
-    """
+    """An event: its kind, its contact (at the end, as it was last seen), and when the frame of it was acquired, ns."""
 
     kind: EventKind
     contact: Contact
@@ -97,12 +73,7 @@ class Events:
         self._seen: dict[int, tuple[Contact, int]] = {}
 
     def of(self, contacts: ContactSet, acquired_ns: int) -> list[ContactEvent]:
-        """Return what has happened since the last frame.
-
-        Args:
-            contacts: of the newest frame.
-            acquired_ns: of this frame.
-        """
+        """Return the events since the last frame, by the contacts of the newest, and when that was acquired."""
         found = []
         for contact in contacts:
             before = self._seen.get(contact.id)

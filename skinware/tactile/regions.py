@@ -11,17 +11,16 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from skinware._columns import Index, as_index, texts
 from skinware.errors import ConfigurationError
 from skinware.geometry import Triple
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
+from skinware.tactile.arrays import Flags
 from skinware.toml_text import TomlText, line_of
 
 _SELECTORS = ("uid", "patch", "module", "frame", "box", "regions")
-Flags = npt.NDArray[np.bool_]
 
 
 class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -110,13 +109,9 @@ class Regions:
     def of(self, skin: SkinLayout | Structure, type_name: str) -> RegionIndex:
         """Return the positions of the sensors of a type, for every region that may have such sensors.
 
-        The result is computed once for each layout or structure.
-
-        Args:
-            skin: the layout of a whole skin (``snapshot.layout``), or the structure of one driver, for which limits to
-                drivers do not count.
-            type_name: type of the sensors. Positions count in the order of ``snapshot.physical(type_name)``, or of
-                ``structure.index(type_name)``.
+        Positions count in the order of ``snapshot.physical(type_name)`` of a whole skin (``snapshot.layout``), or of
+        ``structure.index(type_name)`` of one driver, for which limits to drivers do not count. The result is computed
+        once for each layout or structure.
 
         Raises:
             StructureError: the skin has no such sensors.
@@ -192,13 +187,12 @@ def _named(names: Sequence[set[str]], wanted: Sequence[str]) -> Flags:
 
 @dataclass(frozen=True)
 class SensorChoice:
-    """A choice of sensors: those to which all conditions apply.
+    """A choice of sensors: those to which all conditions apply; an empty one applies to all.
 
     Attributes:
-        types: names of sensor types; empty: all.
-        patches: names of patches; empty: all.
+        types, patches: names of sensor types, and of patches.
         regions: the regions that ``in_regions`` refers to.
-        in_regions: names of regions; a sensor is in any of them; empty: all.
+        in_regions: names of regions; a sensor is in any of them.
     """
 
     types: Collection[str] = ()
@@ -210,22 +204,13 @@ class SensorChoice:
         return bool(self.types or self.patches or self.in_regions)
 
     def unknown(self, structures: Sequence[Structure]) -> Iterator[str]:
-        """Yield a line for each name that does not exist.
-
-        Args:
-            structures: structures of all drivers.
-        """
+        """Yield a line for each name that does not exist in the structures of all drivers."""
         yield from unknown("sensor type", self.types, [each.name for one in structures for each in one.types])
         yield from unknown("patch", self.patches, [name for one in structures for name in one.patch_names])
         yield from unknown("region", self.in_regions, [region.name for region in self.regions])
 
     def of(self, driver: str, structure: Structure) -> Flags:
-        """Return (n_sensors,) bool: the chosen sensors of a driver, in the order of its frames.
-
-        Args:
-            driver: name of the driver.
-            structure: structure of the driver.
-        """
+        """Return (n_sensors,) bool: the chosen sensors of a driver, in the order of its frames."""
         wanted, layout = np.zeros(structure.n_sensors, bool), SkinLayout((driver,), (structure,))
         for name in [each.name for each in structure.types if not self.types or each.name in self.types]:
             inside = np.full(len(structure.module_of(name)), not self.in_regions)
@@ -277,12 +262,7 @@ def read_regions(*paths: str | Path) -> Regions:
 
 
 def regions_to_toml(regions: Iterable[Region], comment: str = "") -> str:
-    """Return the text of a file of regions.
-
-    Args:
-        regions: the regions.
-        comment: lines for its head.
-    """
+    """Return the text of a file of regions, with the lines of a comment at its head."""
     lines = [*(f"# {line}".rstrip() for line in comment.splitlines()), f'format = "{FORMAT}"', f"version = {VERSION}"]
     return "\n".join(lines) + "\n" + "".join(f"\n{_region_text(region)}" for region in regions)
 
@@ -290,13 +270,9 @@ def regions_to_toml(regions: Iterable[Region], comment: str = "") -> str:
 def put_region(path: str | Path, region: Region, *, replace: bool = False) -> None:
     """Write a region into a file, which is created if necessary; everything else in it stays.
 
-    Args:
-        path: path of the file.
-        region: the region.
-        replace: replace a region of this name.
-
     Raises:
-        ConfigurationError: it is no file of regions, has a region of this name, or would be wrong with this one.
+        ConfigurationError: it is no file of regions, would be wrong with this region, or has one of this name, which is
+            not to be replaced.
         OSError: it cannot be written.
     """
     path = Path(path)

@@ -25,11 +25,7 @@ FORGET_AFTER_S = 600.0
 
 
 def resolution_of(structure: Structure, type_name: str) -> float:
-    """Return the step of the values of a sensor type, in its unit; 0 for values without steps.
-
-    Raises:
-        StructureError: no such type here.
-    """
+    """Return the step of the values of a sensor type, in its unit; 0: they have none. Raises StructureError."""
     return 0.0 if structure.dtype.kind == "f" else abs(structure.type(type_name).scale)
 
 

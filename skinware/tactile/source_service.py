@@ -19,6 +19,7 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample, SampleT
 from skinware.service import Column, ServiceReader, ServiceWriter
+from skinware.tactile.arrays import Arrays, Columns
 
 
 class ServiceOptions(TypedDict, total=False):
@@ -30,7 +31,7 @@ class ServiceOptions(TypedDict, total=False):
     group: str | None
 
 
-_STATIC = {
+_STATIC = {  # static column and dtype of each attribute of a source
     "driver": ("driver", "S64"),
     "type_name": ("type_name", "S32"),
     "unit": ("type_unit", "S16"),
@@ -39,7 +40,6 @@ _STATIC = {
     "uid": ("sensor_uid", "<u8"),
     "type_id": ("sensor_type", "<u4"),
 }
-"""Static column and dtype of each attribute of a source."""
 _LISTS = ("frames", "regions")
 
 
@@ -68,19 +68,11 @@ class Source:
 
 @dataclass(frozen=True)
 class ServiceForm:
-    """The form of one kind of service.
-
-    Attributes:
-        kind: its name, and the usual name of such a service.
-        attributes: those that its source has, each in a static column.
-        about: unit of each column of a sample, None for that of the values; and its meaning.
-        columns_of: dtype and shape of each column of a sample, by the source.
-    """
+    """The form of one kind of service: its usual name, the attributes that its source has, and its columns by that."""
 
     kind: str
     attributes: tuple[str, ...]
-    about: Mapping[str, tuple[str | None, str]]
-    columns_of: Callable[[Source], Mapping[str, tuple[str, tuple[int, ...]]]]
+    columns_of: Callable[[Source], Columns]
 
     def read(self, static: Mapping[str, npt.NDArray[Any]]) -> Source:
         """Return the source in static columns; raises LookupError, ValueError or TypeError at another form."""
@@ -97,11 +89,10 @@ class ServiceForm:
             raise ValueError(f"{len(source.uid)} uids of {len(source.type_id)} types")
         return source
 
-    def columns(self, source: Source) -> tuple[dict[str, Column], dict[str, npt.NDArray[Any]]]:
+    def columns(self, source: Source) -> tuple[dict[str, Column], Arrays]:
         """Return the columns of a sample, and the static columns."""
         columns, static = {}, {}
-        for name, (dtype, shape) in self.columns_of(source).items():
-            unit, text = self.about[name]
+        for name, (dtype, shape, unit, text) in self.columns_of(source).items():
             columns[name] = Column(np.dtype(dtype), shape, source.unit if unit is None else unit, text)
         for name in self.attributes:
             (column, dtype), value = _STATIC[name], getattr(source, name)
@@ -158,14 +149,7 @@ class SourceSample(Sample):
 
 
 class SourceReader(ServiceReader[SampleT]):
-    """Reads a service of one kind.
-
-    Args:
-        name: of the service; default: that of its kind.
-        namespace, timeout_s, announce: as for :class:`skinware.service.ServiceReader`, which also lists the errors.
-
-    Attributes:
-        form: of the service.
+    """Reads a service of one kind: a :class:`skinware.service.ServiceReader`, by default of the kind's usual name.
 
     Raises:
         BadServiceFile: the service is of another kind, or its columns are others.

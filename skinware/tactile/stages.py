@@ -1,12 +1,6 @@
 """Filter, scale and amplify the values of n taxels of one type, frame by frame: the stages of a chain.
 
-Each can be used alone::
-
-    stage = FilterSettings(method="median", frames=3).stage(taxels)
-    signal = Signal.of(time_ns, values)
-    stage.step(signal)
-    signal.values
-
+Each can be used alone: make it from its settings with ``stage(taxels)``, and change a :class:`Signal` with ``step``.
 The settings of a stage are also its entry in the file of a chain.
 """
 
@@ -26,10 +20,8 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
+from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
 from skinware.tactile.rule import SIGNED_TYPES, resolution_of
-
-Floats = npt.NDArray[np.float32]
-Flags = npt.NDArray[np.bool_]
 
 NO_UNIT = "1"
 """Unit of values that are no quantity any more."""
@@ -84,19 +76,15 @@ class Taxels:
 
     type: SensorType
     uid: npt.NDArray[np.uint64]
-    module: npt.NDArray[np.int64]
-    patch: npt.NDArray[np.int64]
+    module: Whole
+    patch: Whole
     resolution: float = 0.0
     signed: bool = False
     common: bool = True
 
     @classmethod
     def of(cls, structure: Structure, type_name: str) -> Taxels:
-        """Return the taxels of a type of a driver.
-
-        Raises:
-            StructureError: no such type here.
-        """
+        """Return the taxels of a type of a driver; raises StructureError if it has no such type."""
         sensor_type = structure.type(type_name)
         return cls(
             sensor_type,
@@ -127,16 +115,16 @@ class Stage(ABC):
         self._time_ns: int | None = None
 
     def _passed_s(self, signal: Signal) -> float:
-        """Return the seconds since the frame before; 0 for the first."""
+        """The seconds since the frame before; 0 for the first."""
         before_ns, self._time_ns = self._time_ns, signal.time_ns
         return 0.0 if before_ns is None else max(0, signal.time_ns - before_ns) / NS_PER_S
 
-    def state(self) -> dict[str, npt.NDArray[np.float64]]:
+    def state(self) -> dict[str, Doubles]:
         """Return what baselines behind it need after a restart: arrays (n,) by name, copies."""
         return {}
 
     def restore(  # noqa: B027
-        self, state: Mapping[str, npt.NDArray[np.float64]], rows: npt.NDArray[np.integer]
+        self, state: Mapping[str, Doubles], rows: npt.NDArray[np.integer]
     ) -> None:
         """Go on with the state of another stage: (n,) ``rows`` say where each taxel stands there; -1: nowhere.
 
@@ -150,7 +138,9 @@ class Stage(ABC):
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="stage"):
-    """Settings of a stage. Each has a method ``stage`` that makes it.
+    """Settings of a stage. Each has a method ``stage`` that makes it for some taxels.
+
+    That raises ConfigurationError where it cannot be made; the message says why.
 
     Attributes:
         types: the sensor types that it is for; None: all for which it can be made.
@@ -176,7 +166,6 @@ class FilterSettings(StageSettings, frozen=True, kw_only=True, tag="filter"):
     frames: Annotated[int, msgspec.Meta(ge=2, le=99)] = 3
 
     def stage(self, taxels: Taxels) -> Stage:
-        """Make the stage for some taxels."""
         return Lowpass(taxels, self.tau_s) if self.method == "lowpass" else LastFrames(taxels, self.frames, self.method)
 
 
@@ -241,11 +230,6 @@ class ScalerSettings(StageSettings, frozen=True, kw_only=True, tag="scaler"):
             raise ConfigurationError(f"low = {self.low}, high = {self.high}: give a range")
 
     def stage(self, taxels: Taxels) -> Stage:
-        """Make the stage for some taxels.
-
-        Raises:
-            ConfigurationError: the type has no range; the message says what to do.
-        """
         span = taxels.type.maximum - taxels.type.minimum
         if self.source == "range" and not 0 < span < math.inf:
             least, most = taxels.type.minimum, taxels.type.maximum
@@ -304,7 +288,6 @@ class AmplifierSettings(StageSettings, frozen=True, kw_only=True, tag="amplifier
             )
 
     def stage(self, taxels: Taxels) -> Stage:
-        """Make the stage for some taxels."""
         return Amplifier(taxels, self)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, check_state
 from skinware.tactile.curves import TEMPERATURE
 from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxels
 
@@ -22,8 +23,7 @@ SMOOTH_S = 0.5
 """Time constant of the temperatures in seconds: skins do not warm up faster."""
 GAIN_LASTS_S = 604800.0
 """Seconds, a week, in which a known gain becomes as uncertain as at the start: skins age."""
-_MEDIAN2 = 0.455
-"""Median of the square of a standard normal deviate."""
+_MEDIAN2 = 0.455  # median of the square of a standard normal deviate
 
 
 class ThermalSettings(StageSettings, frozen=True, kw_only=True, tag="thermal"):
@@ -36,11 +36,6 @@ class ThermalSettings(StageSettings, frozen=True, kw_only=True, tag="thermal"):
     spread: Positive = 1.0
 
     def stage(self, taxels: Taxels, pads: Taxels) -> Stage:
-        """Make the stage for some taxels and the temperature sensors of a driver.
-
-        Raises:
-            ConfigurationError: no taxel has a temperature sensor in its module.
-        """
         if not np.isin(taxels.module, pads.module).any():
             raise ConfigurationError(f"no module with {taxels.type.name} has a sensor of type {TEMPERATURE}")
         return ThermalStage(taxels, pads, self.spread)
@@ -49,33 +44,22 @@ class ThermalSettings(StageSettings, frozen=True, kw_only=True, tag="thermal"):
 class ThermalGains:
     """Learns by how much each of n taxels changes with its temperature, from one window of time to the next.
 
-    Args:
-        patch: (n,) int. The taxels of a patch are alike as long as nothing is known of one.
-        spread: standard deviation of the gains before anything is known.
-
-    Attributes:
-        gain: (n,) float64, the change of the value with a unit of the temperature.
-        own: (n,) float64, the same, by what is known of each taxel alone.
-        variance: (n,) float64, of ``own``.
+    The taxels of a patch are alike as long as nothing is known of one; before anything is known, gains have the
+    standard deviation ``spread``. ``own`` is the gain by what is known of each taxel alone, ``variance`` that of it.
     """
 
     def __init__(self, patch: npt.NDArray[np.integer], spread: float) -> None:
         n = len(patch)
-        self.gain: npt.NDArray[np.float64] = np.zeros(n)
+        self.gain: Doubles = np.zeros(n)
         self._patch, self._spread2 = patch, spread**2
-        self.own: npt.NDArray[np.float64] = np.zeros(n)
-        self.variance: npt.NDArray[np.float64] = np.full(n, self._spread2)
+        self.own: Doubles = np.zeros(n)
+        self.variance: Doubles = np.full(n, self._spread2)
         self._noise2 = np.full(int(patch.max(initial=-1)) + 1, np.nan)
         self._noisier = np.ones(n)
         self._means = np.full((2, n), np.nan)
 
-    def learn(self, values: npt.NDArray[np.float64], warmth: npt.NDArray[np.float64]) -> None:
-        """Take in the means of the next window.
-
-        Args:
-            values: (n,) of the taxels; NaN: not known.
-            warmth: (n,) the temperatures of their modules; NaN: not known.
-        """
+    def learn(self, values: Doubles, warmth: Doubles) -> None:
+        """Take in the means of the next window: (n,) values and temperatures of their modules; NaN: not known."""
         means = np.array([values, warmth])
         change, warmed = means - self._means
         self._means = np.where(np.isnan(means), self._means, means)
@@ -105,11 +89,7 @@ class ThermalGains:
 
 
 class ThermalStage(Stage):
-    """Takes what temperatures have changed since its first frame off the values of n taxels.
-
-    Attributes:
-        gains: the gains.
-    """
+    """Takes what temperatures have changed since its first frame off the values of n taxels."""
 
     name = "thermal"
 
@@ -124,19 +104,14 @@ class ThermalStage(Stage):
         """Over a window of time: of the values of taxels and their numbers, and of the temperatures of modules."""
         self._frames, self._window_s = 0, 0.0
 
-    def state(self) -> dict[str, npt.NDArray[np.float64]]:
+    def state(self) -> dict[str, Doubles]:
         warmth = self._warmth[self.taxels.module]
         own, variance = self.gains.own.copy(), self.gains.variance.copy()
         return {"drift": self._drift.copy(), "warmth": warmth, "own": own, "variance": variance}
 
-    def restore(self, state: Mapping[str, npt.NDArray[np.float64]], rows: npt.NDArray[np.integer]) -> None:
-        here, m = np.flatnonzero(rows >= 0), int(rows.max(initial=-1)) + 1
-        for name in ("drift", "warmth", "own", "variance"):
-            given = state.get(name)
-            if given is None or given.dtype != np.float64 or given.ndim != 1 or len(given) < m:
-                raise ConfigurationError(
-                    f"no state of the stage thermal: {name} is missing or has a wrong shape or dtype"
-                )
+    def restore(self, state: Mapping[str, Doubles], rows: npt.NDArray[np.integer]) -> None:
+        check_state("the stage thermal", state, self.state(), rows)
+        here = np.flatnonzero(rows >= 0)
         self._drift[here] = state["drift"][rows[here]]
         self._warmth[self.taxels.module[here]] = state["warmth"][rows[here]]
         self.gains.own[here], self.gains.variance[here] = state["own"][rows[here]], state["variance"][rows[here]]

@@ -4,31 +4,18 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from skinware.realtime import NS_PER_S
+from skinware.tactile.arrays import Arrays, Doubles, Flags, Whole
 from skinware.tactile.meetings import Meetings, fit_bells, resume
-from skinware.tactile.tracks import (
-    TRACK,
-    Flags,
-    Floats,
-    TouchedBlobs,
-    Tracks,
-    Whole,
-    assign,
-    correct,
-    expected_at,
-    is_shared,
-    without_nan,
-)
+from skinware.tactile.tracks import TRACK, TouchedBlobs, Tracks, assign, correct, expected_at, is_shared, without_nan
 
 _STRONG, _WEAK, _LEFT, _NEAR = 5.0, 1.5, 0.3, 0.1
 """Gains of a pair that shares half of the smaller one's taxels, any, is what was left behind, or is near: one of the
 first two outweighs two of the next."""
-_REST = 0.2
-"""Share of its load below which a contact may be what a faster one left behind."""
+_REST = 0.2  # share of its load below which a contact may be what a faster one left behind
 _PREFERENCE = 0.2
 """Gain of the oldest track, and of the largest contact. All pairs of a track have it, so it only decides which is left
 out: the younger identity where contacts merge, the smaller part where one splits."""
@@ -37,25 +24,19 @@ _CLOSENESS = 0.001
 _NEARNESS, _PRESENCE = 0.4, 0.2
 """Gains of a contact just where it was expected, and of one that was there in the last frame. They count where no
 taxels are shared, or the contact is so fast that shared taxels mean nothing."""
-_DOUBT = 0.5
-"""Share of its expected way by which a contact may miss the expected place."""
-_CALM = 3.0
-"""Time constant of the motion that is judged as sliding, in multiples of ``velocity_s``."""
-_NOISE_PITCHES = 0.3
-"""Pitches: standard deviation of the centre of a contact of one taxel."""
+_DOUBT = 0.5  # share of its expected way by which a contact may miss the expected place
+_CALM = 3.0  # time constant of the motion that is judged as sliding, in multiples of ``velocity_s``
+_NOISE_PITCHES = 0.3  # pitches: standard deviation of the centre of a contact of one taxel
 _NEW_M_S, _MOST_NEW, _MOST_FAST = 1.0, 8, 32
 """m/s: spread of the velocity of a new contact. Where more begin in a frame, or more are followed, none is fast."""
 _MOST_WITHIN, _MOST_TAXELS = 4, 400
 """Tracks that a blob carries at most, and taxels of the largest blob that carries more than one."""
-_FAINT = 0.25
-"""A track in a blob has gone if less than this share of its peak is left."""
-_PITCH_M = 0.0065
-"""m: pitch of taxels whose places are not known."""
+_FAINT = 0.25  # a track in a blob has gone if less than this share of its peak is left
+_PITCH_M = 0.0065  # m: pitch of taxels whose places are not known
 _REACH_PITCHES, _GATE = 2.3, 2.5
 """Pitches, or standard deviations of the expected place, by which a contact may miss it without sharing a taxel. 2.3 is
 a bit more than the second ring of neighbours."""
-_NARROWEST_PITCHES = 0.35
-"""Pitches: width of a contact that only one taxel feels."""
+_NARROWEST_PITCHES = 0.35  # pitches: width of a contact that only one taxel feels
 _LAST_ID = (1 << 32) - 1
 
 
@@ -94,31 +75,16 @@ class TrackingSettings:
     steady: float = 0.25
 
 
-class Tracked(NamedTuple):
-    """The history of the m blobs of a frame.
-
-    Attributes:
-        id: (m,) int64, from 1 on; numbers repeat only after 2**32; 0: not a contact yet.
-        age_s: (m,) s.
-        velocity_m_s: (m, 3) m/s, NaN where the centre is not known.
-        kind: (m,) int64, :class:`ContactKind`.
-        provisional: (m,) bool, whether it was never touched for sure.
-    """
-
-    id: Whole
-    age_s: Floats
-    velocity_m_s: Floats
-    kind: Whole
-    provisional: Flags
-
-
-_NOTHING = Tracked(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, bool))
+_NOTHING = {
+    **{name: np.zeros(0, np.int64) for name in ("id", "kind")},
+    "age_s": np.zeros(0),
+    "velocity_m_s": np.zeros((0, 3)),
+    "provisional": np.zeros(0, bool),
+}
 
 
 class Tracker:
-    """Gives contacts their identities, frame by frame.
-
-    A blob in which contacts have merged carries the tracks of all of them.
+    """Gives contacts their identities, frame by frame. A blob in which contacts have merged carries the tracks of all.
 
     Args:
         position_m: (n, 3) m, places of the taxels.
@@ -129,7 +95,7 @@ class Tracker:
         track_of: (n,) int64, the track that each taxel was last in; -1: none.
     """
 
-    def __init__(self, position_m: Floats, pitch_m: float, settings: TrackingSettings | None = None) -> None:
+    def __init__(self, position_m: Doubles, pitch_m: float, settings: TrackingSettings | None = None) -> None:
         self._settings = settings = settings or TrackingSettings()
         self._position_m = position_m
         self._pitch_m = settings.pitch_m or (pitch_m if pitch_m > 0 else _PITCH_M)
@@ -147,8 +113,12 @@ class Tracker:
         self._time_ns = time_ns
         return True
 
-    def follow(self, blobs: TouchedBlobs, time_ns: int) -> Tracked:
-        """Return the identities of the blobs of the next frame, and how they move."""
+    def follow(self, blobs: TouchedBlobs, time_ns: int) -> Arrays:
+        """Return the history of the m blobs of the next frame, by name: arrays (m, ...).
+
+        ``id`` counts from 1 on, and repeats only after 2**32; 0: not a contact yet. ``velocity_m_s`` is (m, 3), NaN
+        where the centre is not known; a ``provisional`` contact was never touched for sure.
+        """
         self._forget(time_ns)
         before, size = self._tracks, np.bincount(blobs.blob, minlength=len(blobs.load))
         if not len(before) and not len(size):
@@ -187,7 +157,7 @@ class Tracker:
             self._tracks = tracks[keep]
             self.track_of[self._taxels] = number[self.track_of[self._taxels]]
 
-    def _homes(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> Whole:
+    def _homes(self, overlap: Doubles, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> Whole:
         """(tracks,) the blob of each; -1: it has gone."""
         tracks, touching = self._tracks, overlap > 0
         way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
@@ -201,7 +171,9 @@ class Tracker:
         self._join(home, overlap, expected, blobs, size)
         return home
 
-    def _gains(self, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, way_m: Floats, by_place: Flags) -> Floats:
+    def _gains(
+        self, overlap: Doubles, expected: Tracks, blobs: TouchedBlobs, way_m: Doubles, by_place: Flags
+    ) -> Doubles:
         """(tracks, m): the gain of each pair; 0: they cannot be the same."""
         tracks = self._tracks
         away = expected["place"][:, None] - blobs.cop_m
@@ -218,7 +190,7 @@ class Tracker:
         near = _NEAR + _NEARNESS * (1 - misses) + _PRESENCE * (tracks["gone_ns"] == 0)[:, None]
         return np.where(is_sharing, sharing, np.where(is_near, near, 0.0))
 
-    def _join(self, home: Whole, overlap: Floats, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> None:
+    def _join(self, home: Whole, overlap: Doubles, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> None:
         """Put tracks that found no blob of their own into that of another."""
         lost = np.flatnonzero((home < 0) & (expected["frames"] > 1) & np.isfinite(expected["place"][:, 0]))
         if not len(lost) or not len(size) or len(lost) > _MOST_NEW:
@@ -280,7 +252,7 @@ class Tracker:
     def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: TouchedBlobs, time_ns: int) -> None:
         """Find the tracks that share a blob, each with its own bell."""
         within = np.flatnonzero(blobs.blob == tracks["home"][rows[0]])
-        fitted = fit_bells(
+        place, variance_m2, peak = fit_bells(
             blobs.value[within],
             self._position_m[blobs.taxels[within]],
             tracks["place"][rows],
@@ -288,15 +260,14 @@ class Tracker:
             tracks["height"][rows],
             tracks["width"][rows],
         )
-        tracks["found"][rows], tracks["noise"][rows] = fitted.place, fitted.variance_m2
-        tracks["height"][rows] = fitted.peak
-        share = fitted.peak * tracks["width"][rows] ** 2
+        tracks["found"][rows], tracks["noise"][rows], tracks["height"][rows] = place, variance_m2, peak
+        share = peak * tracks["width"][rows] ** 2
         tracks["now"][rows] = blobs.load[tracks["home"][rows[0]]] * share / share.sum()
         tracks["size"][rows] = np.maximum(1, np.round(len(within) * share / share.sum()))
         tracks["jumps"][rows] = False
         correct(tracks, rows, time_ns)
-        is_faint = fitted.peak < _FAINT * tracks["peak"][rows]
-        is_faint[fitted.peak.argmax()] = False
+        is_faint = peak < _FAINT * tracks["peak"][rows]
+        is_faint[peak.argmax()] = False
         tracks["home"][rows[is_faint]] = -1
 
     def _move(self, tracks: Tracks, before: Tracks) -> None:
@@ -360,8 +331,8 @@ class Tracker:
         self._taxels = np.concatenate([left, blobs.taxels])
         self._tracks = tracks
 
-    def _tracked(self, tracks: Tracks, time_ns: int) -> Tracked:
-        """Return the identity of the oldest track of each blob, and the mean of their velocities."""
+    def _tracked(self, tracks: Tracks, time_ns: int) -> Arrays:
+        """The oldest track of each blob, and the mean of their velocities."""
         here = np.flatnonzero(tracks["home"] >= 0)
         here = here[np.lexsort([tracks["key"][here], tracks["born_ns"][here], tracks["home"][here]])]
         home = tracks["home"][here]
@@ -374,11 +345,16 @@ class Tracker:
             rows = here[home == blob]
             weight = np.maximum(tracks["now"][rows], 1e-9)
             velocity[blob] = weight @ tracks["velocity"][rows] / weight.sum()
-        age_s = (time_ns - tracks["born_ns"][first]) / NS_PER_S
-        return Tracked(tracks["id"][first], age_s, velocity, tracks["kind"][first], ~tracks["sure"][first])
+        return {
+            "id": tracks["id"][first],
+            "age_s": (time_ns - tracks["born_ns"][first]) / NS_PER_S,
+            "velocity_m_s": velocity,
+            "kind": tracks["kind"][first],
+            "provisional": ~tracks["sure"][first],
+        }
 
 
-def _rank(numbers: Floats | Whole) -> Floats:
+def _rank(numbers: Doubles | Whole) -> Doubles:
     """0 for the smallest to 1 for the largest."""
     rank = np.empty(len(numbers))
     rank[np.argsort(numbers, kind="stable")] = np.arange(len(numbers)) / max(len(numbers) - 1, 1)

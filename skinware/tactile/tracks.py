@@ -8,18 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
+from skinware.tactile.arrays import Doubles, Flags, Whole
 
-Floats = npt.NDArray[np.float64]
-Whole = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 Tracks = npt.NDArray[np.void]
 
 LONGEST_GUESS_S = 0.1
 """Seconds for which a velocity is extrapolated."""
 _ACCELERATION_M_S2, _MANOEUVRE_S = 0.5, 0.1
 """m/s2: spread of the acceleration of a slow contact. That of a fast one changes its velocity in this time, s."""
-_SURPRISE = 3.0
-"""Standard deviations of a miss that is a change of the velocity."""
+_SURPRISE = 3.0  # standard deviations of a miss that is a change of the velocity
 _SHORTEST_S = 1e-3
 
 TRACK = np.dtype(
@@ -56,12 +53,10 @@ TRACK = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class TouchedBlobs:
-    """The m blobs of touched taxels of a frame.
+    """The m blobs of the a touched taxels of a frame.
 
     Attributes:
-        taxels: (a,) int64, the taxels of all of them.
-        blob: (a,) int64, the blob of each.
-        value: (a,) the value of each.
+        taxels, blob, value: (a,) the taxels, the blob of each, and its value.
         load, peak: (m,) sum and maximum of the values of each blob.
         frame: (m,) int64, number of its coordinate frame, -1 for none.
         cop_m: (m, 3) m, its centre; NaN if it is not known.
@@ -71,11 +66,11 @@ class TouchedBlobs:
 
     taxels: Whole
     blob: Whole
-    value: Floats
-    load: Floats
-    peak: Floats
+    value: Doubles
+    load: Doubles
+    peak: Doubles
     frame: Whole
-    cop_m: Floats
+    cop_m: Doubles
     is_sure: Flags
     frames: Whole
 
@@ -102,8 +97,7 @@ def expected_at(tracks: Tracks, time_ns: int) -> Tracks:
     return expected
 
 
-def without_nan(numbers: Floats) -> Floats:
-    """The numbers, 0 in place of NaN."""
+def without_nan(numbers: Doubles) -> Doubles:
     return np.where(np.isnan(numbers), 0.0, numbers)
 
 
@@ -128,11 +122,8 @@ def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
         tracks[rows] = now
 
 
-def assign(gain: Floats) -> tuple[Whole, Whole]:
-    """Assign rows to columns, each at most once, so that the sum of gains is the largest.
-
-    Args:
-        gain: (r, c) gain of each pair; 0 or less: the pair is impossible.
+def assign(gain: Doubles) -> tuple[Whole, Whole]:
+    """Assign rows to columns, each at most once, so that the sum of (r, c) gains is the largest; 0 or less: impossible.
 
     Returns:
         (p,) int64 rows, in ascending order, and (p,) int64, the column of each.
@@ -155,7 +146,7 @@ def assign(gain: Floats) -> tuple[Whole, Whole]:
     return row, column_of[row]
 
 
-def _cheapest(cost: Floats) -> Whole:
+def _cheapest(cost: Doubles) -> Whole:
     """(r,) int64: a column for each of r rows (at most as many as columns), for the smallest sum.
 
     By shortest augmenting paths: each row joins along the path of exchanges that costs least. ``of_row`` and

@@ -18,8 +18,9 @@ import numpy.typing as npt
 from skinware import native
 from skinware.errors import ConfigurationError
 from skinware.native import give_arrays, read_structs
+from skinware.tactile.arrays import Doubles, Flags, Floats
 from skinware.tactile.rule import FORGET_AFTER_S
-from skinware.tactile.stages import Floats, Positive, Signal, Stage, StageSettings, Taxels
+from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxels
 
 AXES = (
     ("magnetic_field_x", "magnetic_field_y", "magnetic_field_z"),
@@ -31,15 +32,14 @@ LEAST_ARRAY = 4
 """Taxels of a patch that it takes to know a touch from a field."""
 
 _STRUCTS = read_structs([Path(native.__file__).with_name("field.h")])
-_NUMBERS = {"response": 12, "covariance": 16, "load": 3, "rest": 3}
-"""Numbers of a taxel, where there are several."""
+_NUMBERS = {"response": 12, "covariance": 16, "load": 3, "rest": 3}  # numbers of a taxel, where there are several
 
 _update = native.core().quick.skinware_field_update
 _update.argtypes, _update.restype = (*(ctypes.c_void_p,) * 3, ctypes.c_double, ctypes.c_void_p), None
 
 
 def vectors_of(taxels: Mapping[str, Taxels]) -> list[tuple[str, ...]]:
-    """Return the types that are axes of the same taxels, among those of a driver by name."""
+    """The types that are axes of the same taxels, among those of a driver by name."""
     return [
         names
         for names in AXES
@@ -51,9 +51,7 @@ def vectors_of(taxels: Mapping[str, Taxels]) -> list[tuple[str, ...]]:
 class ArrayField:
     """Follows a uniform field, and how each of n three-axis taxels responds to it.
 
-    Args:
-        patch: (n,) int, the patch of each taxel. Neighbouring taxels of one patch are a rigid array.
-        spread: standard deviation of the responses around 1.
+    Neighbouring taxels of one patch are a rigid array. ``spread`` is the standard deviation of the responses around 1.
     """
 
     def __init__(self, patch: npt.NDArray[np.integer], spread: float) -> None:
@@ -72,29 +70,21 @@ class ArrayField:
         self._at = ctypes.addressof(words)
 
     def __len__(self) -> int:
-        """Return the number of arrays."""
         return len(self._memory)
 
     @property
-    def now(self) -> npt.NDArray[np.float64]:
+    def now(self) -> Doubles:
         """(arrays, 3) the change of the field at each array since its first frame; a copy."""
         return np.array([list(array.field) for array in self._memory]).reshape(-1, 3)
 
     @property
-    def bears(self) -> npt.NDArray[np.bool_]:
+    def bears(self) -> Flags:
         """(n,) bool, which taxels bear a load in the newest frame; a copy."""
-        bears: npt.NDArray[np.bool_] = self._arrays["bears"].copy()
+        bears: Flags = self._arrays["bears"].copy()
         return bears
 
-    def update(
-        self, values: Floats, usable: npt.NDArray[np.bool_], passed_s: float
-    ) -> tuple[Floats, npt.NDArray[np.bool_]]:
-        """Take in the next frame.
-
-        Args:
-            values: (3, n) float32.
-            usable: (n,) bool, which taxels have values of this frame.
-            passed_s: since the frame before.
+    def update(self, values: Floats, usable: Flags, passed_s: float) -> tuple[Floats, Flags]:
+        """Take in (3, n) float32 values, (n,) bool usable, and the seconds since the frame before.
 
         Returns:
             (3, n) float32, the values without level and field; and (n,) bool, which of them are certain enough to say
@@ -116,11 +106,6 @@ class FieldSettings(StageSettings, frozen=True, kw_only=True, tag="field"):
     spread: Positive = 0.1
 
     def stage(self, *axes: Taxels) -> Stage:
-        """Make the stage for the three axes of some taxels.
-
-        Raises:
-            ConfigurationError: no patch has enough of them.
-        """
         stage = FieldStage(axes, self.spread)
         if not len(stage.field):
             raise ConfigurationError(f"no patch has {LEAST_ARRAY} taxels of {axes[0].type.name}")
@@ -128,11 +113,7 @@ class FieldSettings(StageSettings, frozen=True, kw_only=True, tag="field"):
 
 
 class FieldStage(Stage):
-    """Takes level and field off the three axes of n taxels.
-
-    Attributes:
-        field: the field.
-    """
+    """Takes level and field off the three axes of n taxels."""
 
     name = "field"
 
@@ -157,7 +138,6 @@ class VectorSettings(StageSettings, frozen=True, kw_only=True, tag="vector"):
     """Settings of vectors: all axes of a taxel are touched where one is."""
 
     def stage(self, *axes: Taxels) -> Stage:
-        """Make the stage for the three axes of some taxels."""
         return VectorStage(*axes)
 
 

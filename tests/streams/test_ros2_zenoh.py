@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from skinware import DriverSnapshot, Namespace
+from skinware import DriverReader, DriverSnapshot, Namespace
 from skinware.errors import ConfigurationError
 from skinware.ros2.rmw_zenoh import MessageAttachment, ZenohNode
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
@@ -24,7 +24,7 @@ from skinware_drivers.streams.ros2_presets import TEXTS
 from skinware_drivers.streams.ros2_zenoh import ZenohPort, ZenohTopicBus, publisher_of
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
-from tests.commands import run
+from tests.commands import run, running
 from tests.ros2.router import Router, router, sockets
 from tests.ros2.sdk_peer import sdk_peer
 from tests.streams.ros2_peer import CASES, Case, same, serialized
@@ -182,6 +182,20 @@ def test_topics_are_found(at: Router) -> None:
         [bus] = json.loads(run("skin-find", bus_name, "--listen", "3", "--json").stdout)["buses"]
         [topic] = bus["topics"]
         assert (topic["topic"], topic["publishers"], topic["drivers"]) == ("rt/cloud", 1, ["ros2"])
+
+
+@pytest.mark.thorough
+def test_topics_are_captured_and_replayed(at: Router, tmp_path: Path) -> None:
+    capture = f"{tmp_path}/touch.mcap"
+    bus = ("--bus", f"ros2://7?router={at.endpoint}", "--capture", capture)
+    with published(at, case_of("tactile_msgs/msg/TactileState"), domain=7):
+        with running("skin-driver", "--driver", "ros2", *bus) as driver:
+            assert driver.wait_for("ready")["sensors"] == 8
+            driver.wait_for("status", lambda event: event["buses"][0]["frames"] > 100)
+    with running("skin-driver", "--bus", f"replay:{capture}") as replayed:
+        assert replayed.wait_for("ready")["sensors"] == 8
+        with DriverReader("ros2") as reader:
+            assert read_until(reader, is_whole).structure.module_name.tolist() == [b"thumb", b"sensors 1"]
 
 
 @pytest.mark.parametrize("name", ["ros2://x", "ros2://300", "ros2://0?router=nowhere", "ros2://0?qos=reliable"])

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from skinware.tactile.tracks import Floats, assign
+from skinware.tactile.arrays import Doubles
+from skinware.tactile.tracks import assign
 
 gains = hnp.arrays(
     np.float64,
@@ -18,7 +19,7 @@ gains = hnp.arrays(
 )
 
 
-def most(gain: Floats) -> float:
+def most(gain: Doubles) -> float:
     """The largest sum, by trying all."""
     gain = np.maximum(gain, 0)
     if gain.shape[0] > gain.shape[1]:
@@ -28,7 +29,7 @@ def most(gain: Floats) -> float:
 
 
 @given(gains)
-def test_the_sum_is_the_largest_there_is(gain: Floats) -> None:
+def test_the_sum_is_the_largest_there_is(gain: Doubles) -> None:
     row, column = assign(gain)
     assert len(set(row.tolist())) == len(row) == len(column) == len(set(column.tolist()))
     assert (np.diff(row) > 0).all()

@@ -20,7 +20,7 @@ from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState, save_state
 from skinware.tactile.contacts_service import ContactsReader
 from skinware.tactile.derived_services import CalmHealth
-from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
+from skinware.tactile.health_report import COLUMNS, NOTHING, HealthKind, HealthReport
 from skinware.tactile.health_service import HealthReader, HealthWriter
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.tactile.test_calm_contacts import calming, press
@@ -132,11 +132,10 @@ def test_health_that_does_not_fit_is_begun_anew(
     with calmed(into) as skin:
         skin.go_on(SETTLED_NS)
         state = LearnedState(path, skin.health).state(skin.chain)
-        known = state.health["pressure"]
         if damage == "missing":
-            del known["noise"]
+            del state.arrays["health/pressure/noise"]
         elif damage == "shape":
-            known["noise"] = np.zeros((640, 2), np.float32)
+            state.arrays["health/pressure/noise"] = np.zeros((640, 2), np.float32)
         save_state(path, replace(state, fingerprint="another") if damage == "of another scale" else state)
     with calmed(into) as skin:
         LearnedState(path, skin.health).restore(skin.chain)
@@ -218,7 +217,7 @@ def test_services_of_another_kind_or_form_are_refused(into: Namespace) -> None:
         "sensor_type": np.zeros(n, np.uint32),
         "driver": np.array([b"fake"], "S64"),
     }
-    columns = {name: (dtype, (n,)) for name, (dtype, _) in COLUMNS.items()}
+    columns = {name: (dtype, (n,)) for name, (dtype, *_) in COLUMNS.items()}
     with (
         HealthWriter(fake_structure(), "fake", namespace=into),
         pytest.raises(BadServiceFile, match="not of kind 'contacts'"),
@@ -237,7 +236,7 @@ def test_services_of_another_kind_or_form_are_refused(into: Namespace) -> None:
                 HealthReader("odd", namespace=into)
     with ServiceWriter("fine", columns, static, namespace=into, kind="health") as writer:
         arrays = writer.begin()
-        for name, (_, nothing) in COLUMNS.items():
+        for name, nothing in NOTHING.items():
             arrays[name][:] = nothing
         writer.commit(1)
         with HealthReader("fine", namespace=into) as reader, ServiceReader("fine", namespace=into):

@@ -218,9 +218,9 @@ def test_a_state_that_is_no_good_is_left_alone(tmp_path: Path, damage: str, capl
     chain = ChainSettings.calm().chain(structure)
     state = chain.state()
     if damage == "keys":
-        del state.arrays["pressure"]["noise2"]
+        del state.arrays["pressure/noise2"]
     if damage == "shapes":
-        state.arrays["pressure"]["level"] = np.zeros((640, 2), np.float32)
+        state.arrays["pressure/level"] = np.zeros((640, 2), np.float32)
     save_state(path, state)
     whole = path.read_bytes()
     if damage == "empty":

@@ -80,7 +80,7 @@ def test_any_program_sees_columns_of_64_rows(namespace: Namespace) -> None:
         writer.publish(value, value > 0, 2)
         with ServiceReader(writer.name, namespace=namespace) as reader:
             frame = reader.read(timeout_s=10)
-            for name, (dtype, shape) in COLUMNS.items():
+            for name, (dtype, shape, *_) in COLUMNS.items():
                 column = frame.column(name)
                 assert (column.dtype, column.shape) == (np.dtype(dtype), (MOST, *shape))
                 rest = column[1:]

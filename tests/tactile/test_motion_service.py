@@ -104,7 +104,7 @@ def test_the_command_takes_files_of_regions(into: Namespace, tmp_path: Path, mon
 
 
 def test_services_of_another_kind_or_form_are_refused(into: Namespace) -> None:
-    columns = {name: (dtype, (2, *shape)) for name, (dtype, shape) in COLUMNS.items()}
+    columns = {name: (dtype, (2, *shape)) for name, (dtype, shape, *_) in COLUMNS.items()}
     static = {
         "region_name": np.array([b"one", b"two"]),
         "frame_name": np.array([b"palm"]),

@@ -191,7 +191,7 @@ def test_a_chain_keeps_what_its_baselines_need(tmp_path: Path) -> None:
     state, why = read_state(tmp_path / "state.npz")
     assert not why
     assert state is not None
-    assert "thermal.own" in state.arrays["pressure"]
+    assert "pressure/thermal.own" in state.arrays
     after.restore(state)
     (stage,) = (stage for stage in after.stages["pressure"] if isinstance(stage, ThermalStage))
     assert stage.gains.gain == pytest.approx(0.5)

@@ -257,3 +257,16 @@ def test_any_sequence_of_patterns_gives_each_contact_one_identity(seed: int, sha
         new = set(now) - known
         assert not new or min(new) > max(known, default=0)
         known |= set(now)
+
+
+def test_merged_contacts_may_lose_all_load() -> None:
+    """Two contacts share a blob of which a provisional touch without a load is left: both bells are fitted to 0."""
+    scene, middle = Scene(), np.array([0.06, 0.06, 0.0])
+    for step in range(26):
+        away = np.array([0.02 - 0.0008 * step, 0.0, 0.0])
+        merged = scene.show(middle - away, middle + away, radius_m=0.012)
+    assert len(merged) == 1
+    onset = np.linalg.norm(FLAT - middle, axis=1) < 0.6 * PITCH_M
+    nothing = np.zeros(len(FLAT))
+    left = scene.contacts.update(nothing, nothing > 0, scene.time_ns + scene.period_ns, onset=onset)
+    assert (left.id.tolist(), left.load.tolist()) == (merged.id.tolist(), [0.0])

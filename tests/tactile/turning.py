@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.sensor_types import MAGNETIC_FIELD, PRESSURE, SHEAR_X, SHEAR_Y
-from skinware.tactile.baseline_stage import BaselineStageSettings
+from skinware.tactile.chain import BaselineStageSettings
 from skinware.tactile.stages import Signal, Stage, Taxels
 from skinware.tactile.vectors import FieldSettings, VectorSettings
 

@@ -15,9 +15,9 @@ import numpy.typing as npt
 from skinware import Structure
 from skinware.sensor_types import MAGNETIC_FIELD, PRESSURE, TEMPERATURE
 from skinware.tactile import Baseline, Box, Contacts, Health, HealthKind, HealthSettings, Region, Regions
-from skinware.tactile.baseline_stage import BaselineStageSettings
 from skinware.tactile.calibration.placing import Presses, place
 from skinware.tactile.calibration.shapes import shapes_of
+from skinware.tactile.chain import BaselineStageSettings
 from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.stages import Signal, Taxels

@@ -52,6 +52,9 @@ class Skinware(Robot):
         self._totals: Totals | None = None
         self._contacts: ContactsReader | None = None
 
+    def __str__(self) -> str:
+        return f"{self.robot} with touch"
+
     @property
     def _numbers(self) -> Totals:
         """Names come from the drivers, so that they must run before the robot connects."""

@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.geometry import Geometry
+from skinware.tactile.arrays import Doubles, Flags, Whole
 from skinware.tactile.calibration.topology import Topology
 
-ArrayF = npt.NDArray[np.float64]
-ArrayI = npt.NDArray[np.int64]
 Groups = npt.NDArray[np.integer]
 
 SHARED, UNKNOWN, SWAPPED, MIRRORED, TURNED, OFF = "shared", "unknown", "swapped", "mirrored", "turned", "off"
@@ -25,18 +24,13 @@ SHARED, UNKNOWN, SWAPPED, MIRRORED, TURNED, OFF = "shared", "unknown", "swapped"
 _SAME_PLACE_M = 1e-5
 _OFF_M = 0.010
 _CAP_M = 0.015
-_NEAR_M = 0.009
-"""Taxels that a file puts nearer to each other than this must be felt together."""
-_BAD_M = 0.0025
-"""Mean disagreement of a module with its surroundings from which it is wrong."""
-_BETTER = 0.6
-"""Share of the disagreement that another explanation may leave."""
+_NEAR_M = 0.009  # taxels that a file puts nearer to each other than this must be felt together
+_BAD_M = 0.0025  # mean disagreement of a module with its surroundings from which it is wrong
+_BETTER = 0.6  # share of the disagreement that another explanation may leave
 _LEAST_DISTANCES = 6
-_MOST_BAD = 64
-"""Groups that are tried at each other's places, those that are farthest off."""
+_MOST_BAD = 64  # groups that are tried at each other's places, those that are farthest off
 _TURNS = 24
-_NEAREST = 6
-"""Measured neighbours that determine the place of a taxel."""
+_NEAREST = 6  # measured neighbours that determine the place of a taxel
 
 
 @dataclass(frozen=True)
@@ -54,7 +48,7 @@ class Finding:
     """
 
     kind: str
-    taxels: ArrayI
+    taxels: Whole
     modules: tuple[int, ...] = ()
     patches: tuple[int, ...] = ()
     off_m: float = float("nan")
@@ -62,11 +56,9 @@ class Finding:
 
 
 def check_file(geometry: Geometry, module: npt.NDArray[np.integer]) -> list[Finding]:
-    """Return the errors that a geometry shows by itself: shared places, taxels without a place.
+    """Return the errors that a geometry of n taxels shows by itself: shared places, taxels without a place.
 
-    Args:
-        geometry: geometry of n taxels.
-        module: (n,) module of each.
+    ``module`` is (n,), the module of each.
     """
     found: list[Finding] = []
     known = np.flatnonzero(geometry.known)
@@ -86,19 +78,9 @@ def check_file(geometry: Geometry, module: npt.NDArray[np.integer]) -> list[Find
 
 
 def check_strokes(
-    geometry: Geometry,
-    module: npt.NDArray[np.integer],
-    patch: npt.NDArray[np.integer],
-    topology: Topology,
+    geometry: Geometry, module: npt.NDArray[np.integer], patch: npt.NDArray[np.integer], topology: Topology
 ) -> list[Finding]:
-    """Return the errors of a geometry by strokes.
-
-    Args:
-        geometry: geometry of n taxels.
-        module: (n,) module of each.
-        patch: (n,) patch of each.
-        topology: topology of the same taxels.
-    """
+    """Return the errors of a geometry of n taxels by strokes, with (n,) modules and patches, and their topology."""
     check = _Check(geometry, topology)
     named = np.zeros(len(geometry), bool)
     found: list[Finding] = []
@@ -122,20 +104,12 @@ class _Check:
         self._distance = topology.distance_m
 
     def _disagreement_m(
-        self, taxels: ArrayI, group: Groups, place: ArrayF | None = None, frame: ArrayI | None = None
+        self, taxels: Whole, group: Groups, place: Doubles | None = None, frame: Whole | None = None
     ) -> float:
-        """The mean difference between measured and given distances from taxels to those of other groups.
+        """The mean difference between measured and given distances from taxels to those of other groups; NaN: too few.
 
-        Taxels that are near each other in the file and were never felt together disagree, too.
-
-        Args:
-            taxels: (k,).
-            group: (n,) of all taxels.
-            place: (n, 3) their places; None: those of the file.
-            frame: (n,) frames of the places.
-
-        Returns:
-            NaN if there are too few.
+        Taxels that are near each other in the file and were never felt together disagree, too. (n, 3) places and (n,)
+        frames are those of the file unless they are given.
         """
         place = self._place if place is None else place
         frame = self._frame if frame is None else frame
@@ -148,13 +122,11 @@ class _Check:
             return float("nan")
         return float(np.minimum(abs(measured[tells] - said[tells]), _CAP_M).mean())
 
-    def swapped(self, group: Groups, named: npt.NDArray[np.bool_]) -> Iterator[tuple[ArrayI, tuple[int, int], float]]:
+    def swapped(self, group: Groups, named: Flags) -> Iterator[tuple[Whole, tuple[int, int], float]]:
         """Yield pairs of groups that agree at each other's places and not at their own, the clearest first.
 
-        Each pair is exchanged before the search goes on, as an exchange disturbs its neighbours.
-
-        Yields:
-            The taxels of a pair, its numbers, and how far it is off at the places of the file.
+        Each is its taxels, its numbers, and how far it is off at the places of the file. Each pair is exchanged before
+        the search goes on, as an exchange disturbs its neighbours.
         """
         while found := self._clearest_swap(group, named):
             _, both, there, pair, own = found
@@ -162,9 +134,7 @@ class _Check:
             named[both] = True
             yield both, pair, own
 
-    def _clearest_swap(
-        self, group: Groups, named: npt.NDArray[np.bool_]
-    ) -> tuple[float, ArrayI, ArrayI, tuple[int, int], float] | None:
+    def _clearest_swap(self, group: Groups, named: Flags) -> tuple[float, Whole, Whole, tuple[int, int], float] | None:
         """The best pair: share of the disagreement that is left, its taxels, their right places, numbers, distance."""
         taxels_of = {number: np.flatnonzero(group == number) for number in np.unique(group[~named]).tolist()}
         off = {number: self._disagreement_m(taxels, group) for number, taxels in taxels_of.items()}
@@ -182,7 +152,7 @@ class _Check:
                 candidates.append((crossed / own, both, there, (one, other), own))
         return min(candidates, key=lambda candidate: candidate[0], default=None)
 
-    def turned(self, module: Groups, named: npt.NDArray[np.bool_]) -> Iterator[Finding]:
+    def turned(self, module: Groups, named: Flags) -> Iterator[Finding]:
         """Yield modules that agree as their mirror image, or turned about their normal, and not as they are."""
         for number in np.unique(module[~named]).tolist():
             taxels = np.flatnonzero((module == number) & self._known & ~named)
@@ -201,7 +171,7 @@ class _Check:
                 kind = MIRRORED if mirrored else TURNED
                 yield Finding(kind, taxels, (number,), off_m=as_is, degrees=float("nan") if mirrored else degrees)
 
-    def off(self, module: Groups, named: npt.NDArray[np.bool_]) -> Iterator[Finding]:
+    def off(self, module: Groups, named: Flags) -> Iterator[Finding]:
         """Yield taxels more than 10 mm away from their nearest ones."""
         trusted = np.flatnonzero(self._known & ~named)
         nearest = np.argsort(self._distance[np.ix_(trusted, trusted)], axis=1, kind="stable")[:, :_NEAREST]
@@ -218,7 +188,7 @@ class _Check:
                 yield Finding(OFF, np.array([taxel]), (int(module[taxel]),), off_m=float(np.linalg.norm(away)))
 
 
-def _turns(places: ArrayF) -> Iterator[tuple[bool, float, ArrayF]]:
+def _turns(places: Doubles) -> Iterator[tuple[bool, float, Doubles]]:
     """Places of a module, and of its mirror image, turned about their middle in their plane."""
     middle = places.mean(axis=0)
     axes = np.linalg.svd(places - middle, full_matrices=False)[2]

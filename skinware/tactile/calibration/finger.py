@@ -14,18 +14,15 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, Flags
 from skinware.tactile.calibration.placing import Placement, Presses, place
 from skinware.tactile.calibration.shapes import Pose, Shape, fitted
-
-ArrayF = npt.NDArray[np.float64]
-ArrayI = npt.NDArray[np.int64]
 
 _SOFT_M = 0.003
 _ROUNDS = 60
 _LEAST_PRESSES = 8
 _WRONG_M = 0.02
-_PROGRESS = 1e-6
-"""Share of the cost: a round that gains less is the last."""
+_PROGRESS = 1e-6  # share of the cost: a round that gains less is the last
 _LEAST_DAMPING, _MOST_DAMPING, _TINY = 1e-9, 1e6, 1e-12
 
 
@@ -49,8 +46,8 @@ def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.Array
     return problem.placement()
 
 
-def _points_m(presses: Presses, tip_m: ArrayF) -> ArrayF:
-    points: ArrayF = presses.pose[:, :3, :3] @ tip_m + presses.pose[:, :3, 3]
+def _points_m(presses: Presses, tip_m: Doubles) -> Doubles:
+    points: Doubles = presses.pose[:, :3, :3] @ tip_m + presses.pose[:, :3, 3]
     return points
 
 
@@ -60,15 +57,13 @@ class _Problem:
 
     presses: Presses
     shapes: dict[int, Shape]
-    tip_m: ArrayF
+    tip_m: Doubles
     poses: dict[int, Pose]
-    shares: dict[int, ArrayF]
-    """By module, (m, k): the share of each press that its taxels felt."""
-    counting: npt.NDArray[np.bool_]
-    """(m,) presses that only modules with poses felt."""
+    shares: dict[int, Doubles]  # by module, (m, k): the share of each press that its taxels felt
+    counting: Flags  # (m,) presses that only modules with poses felt
 
     @classmethod
-    def of(cls, presses: Presses, shapes: Mapping[int, Shape], tip_m: ArrayF) -> _Problem:
+    def of(cls, presses: Presses, shapes: Mapping[int, Shape], tip_m: Doubles) -> _Problem:
         guess = place(Presses(presses.n, _points_m(presses, tip_m), presses.press, presses.taxel, presses.load))
         known = guess.known
         weight = np.where(known, 1.0, 0.0)
@@ -93,7 +88,7 @@ class _Problem:
             raise ConfigurationError("too few presses are on modules of a known shape that were touched often enough")
         return cls(presses, used, tip_m.copy(), poses, shares, counting)
 
-    def residuals(self) -> ArrayF:
+    def residuals(self) -> Doubles:
         """(m, 3) from the centre of the taxels that felt each press to the tip, m."""
         centre = np.zeros((len(self.presses), 3))
         for number, share in self.shares.items():
@@ -125,7 +120,7 @@ class _Problem:
             if gained <= _PROGRESS * cost:
                 return
 
-    def _normal_equations(self) -> tuple[ArrayF, ArrayF]:
+    def _normal_equations(self) -> tuple[Doubles, Doubles]:
         """Matrix and right side for a step of the tip and, by module, its turn and shift."""
         rows = self.counting
         residual = self.residuals()[rows]
@@ -156,7 +151,7 @@ class _Problem:
         return Placement(position, normal, error, pressed, residual, wrong, tip_m=self.tip_m)
 
 
-def _crossing(arm: ArrayF) -> ArrayF:
+def _crossing(arm: Doubles) -> Doubles:
     """(m, 3, 3): the matrix of the cross product with each arm."""
     x, y, z = arm.T
     nothing = np.zeros_like(x)
@@ -164,11 +159,11 @@ def _crossing(arm: ArrayF) -> ArrayF:
     return np.moveaxis(np.array(rows), 2, 0)
 
 
-def _rotation(turn: ArrayF) -> ArrayF:
+def _rotation(turn: Doubles) -> Doubles:
     """(3, 3) of a vector of rotation, rad (Rodrigues)."""
     angle = float(np.linalg.norm(turn))
     if angle < 1e-12:
         return np.eye(3)
     axis = _crossing((turn / angle)[None])[0]
-    rotation: ArrayF = np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
+    rotation: Doubles = np.eye(3) + np.sin(angle) * axis + (1 - np.cos(angle)) * axis @ axis
     return rotation

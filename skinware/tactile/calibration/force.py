@@ -16,27 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, Flags
 from skinware.tactile.curves import MOST_KNOTS, Curve, LoadMemory
 
-ArrayF = npt.NDArray[np.float64]
-
-_PLAYS = (0.05, 0.1, 0.2, 0.4)
-"""Shares of the range that are tried as play."""
+_PLAYS = (0.05, 0.1, 0.2, 0.4)  # shares of the range that are tried as play
 _CREEPS_S = (3.0, 10.0, 30.0, 100.0)
-_PARTS = 10
-"""Parts of the frames that are left out in turn, for the uncertainty."""
+_PARTS = 10  # parts of the frames that are left out in turn, for the uncertainty
 _GAIN_SPREAD = 0.3
-_LEAST_GAIN = 0.1
-"""Taxels that are always pressed together may have any gains that fit, even below 0."""
+_LEAST_GAIN = 0.1  # taxels that are always pressed together may have any gains that fit, even below 0
 _ROUNDS = 4
 _LEAST_FRAMES = 200
-_FEW_PRESSES, _APART_S = 8, 0.3
-"""Presses that a fit needs to be trusted, and seconds without any load between two."""
-_LEAST_WARMTH_K = 2.0
-"""Kelvin by which the temperature must change, or its influence is not known."""
+_FEW_PRESSES, _APART_S = 8, 0.3  # presses that a fit needs to be trusted, and seconds without any load between two
+_LEAST_WARMTH_K = 2.0  # kelvin by which the temperature must change, or its influence is not known
 _LEAST_SHARE = 0.1
-_POOR = 0.1
-"""Share of the largest force: a larger residual makes a fit worth little."""
+_POOR = 0.1  # share of the largest force: a larger residual makes a fit worth little
 
 
 @dataclass(frozen=True)
@@ -46,14 +39,13 @@ class ForceData:
     Attributes:
         time_s: (m,) rising.
         load: (m, n) calmed values, 0: untouched.
-        force_n: (m,) the reference, N.
-        temperature_c: (m,) of the skin; NaN: not known.
+        force_n, temperature_c: (m,) the reference, N, and the temperature of the skin; NaN: not known.
     """
 
-    time_s: ArrayF
-    load: ArrayF
-    force_n: ArrayF
-    temperature_c: ArrayF
+    time_s: Doubles
+    load: Doubles
+    force_n: Doubles
+    temperature_c: Doubles
 
 
 @dataclass(frozen=True)
@@ -71,7 +63,7 @@ class ForceFit:
     """
 
     curve: Curve
-    gain: ArrayF
+    gain: Doubles
     residual_n: float
     reach_n: float
     hysteresis: float
@@ -97,12 +89,7 @@ class ForceFit:
 
 
 def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "counts") -> ForceFit:
-    """Fit curves in N to frames with a reference.
-
-    Args:
-        data: the frames; loads that rise, rest and fall, over the wanted range.
-        type_name: type of the taxels.
-        from_unit: unit of the loads.
+    """Fit curves in N to frames with a reference: loads that rise, rest and fall, over the wanted range.
 
     Raises:
         ConfigurationError: too few frames with a load, or loads that do not vary.
@@ -149,7 +136,7 @@ def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "co
     return ForceFit(curve, of_all, residual, reach, curve.hysteresis or 0.0, held, presses)
 
 
-def _lived(time_s: ArrayF, load: ArrayF, play: float, creep_s: float) -> ArrayF:
+def _lived(time_s: Doubles, load: Doubles, play: float, creep_s: float) -> Doubles:
     """(2, m, n): the past of taxels, as a curve needs it."""
     memory, lived = LoadMemory(load.shape[1]), np.zeros((2, *load.shape))
     for row, passed_s in enumerate(np.diff(time_s, prepend=time_s[0]).tolist()):
@@ -162,14 +149,14 @@ class _Trial:
 
     def __init__(
         self,
-        force_n: ArrayF,
-        load: ArrayF,
-        knots: ArrayF,
+        force_n: Doubles,
+        load: Doubles,
+        knots: Doubles,
         play: float,
-        lag: ArrayF,
+        lag: Doubles,
         creep_s: float,
-        slow: ArrayF,
-        warmth: ArrayF,
+        slow: Doubles,
+        warmth: Doubles,
     ) -> None:
         self.play, self.creep_s, self.force_n = play, creep_s, force_n
         self.every = np.ones(len(force_n), bool)
@@ -180,7 +167,7 @@ class _Trial:
         self._terms = np.array([*pieces, lag * touched, slow * touched, load * warmth[:, None]])
         """(terms, frames, taxels)."""
 
-    def weights(self, gain: ArrayF, rows: npt.NDArray[np.bool_] | None = None) -> ArrayF:
+    def weights(self, gain: Doubles, rows: Flags | None = None) -> Doubles:
         """The weights of the terms, those of the curve at least 0, by least squares."""
         rows = self.every if rows is None else rows
         matrix = (self._terms[:, rows] @ gain).T
@@ -193,14 +180,14 @@ class _Trial:
                 return found
             free &= ~falling
 
-    def cost(self, weights: ArrayF, gain: ArrayF) -> float:
+    def cost(self, weights: Doubles, gain: Doubles) -> float:
         return float(((self.force_n - self.forces(weights, gain)) ** 2).sum())
 
-    def forces(self, weights: ArrayF, gain: ArrayF) -> ArrayF:
-        forces: ArrayF = np.tensordot(weights, self._terms, 1) @ gain
+    def forces(self, weights: Doubles, gain: Doubles) -> Doubles:
+        forces: Doubles = np.tensordot(weights, self._terms, 1) @ gain
         return forces
 
-    def solve(self, rows: npt.NDArray[np.bool_]) -> tuple[ArrayF, ArrayF]:
+    def solve(self, rows: Flags) -> tuple[Doubles, Doubles]:
         """Gains of the taxels, and weights, by turns."""
         gain = np.ones(self._terms.shape[2])
         weights = self.weights(gain, rows)
@@ -217,9 +204,8 @@ class _Trial:
 def _errors(problem: _Trial, presses: int) -> tuple[tuple[float, float], float, float]:
     """Standard deviation of a taxel at 0 N and its growth with the force; the whole residual; the share that it holds.
 
+    All is of frames that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
     Deviations of the taxels of a contact add up to the deviation of its force.
-
-    All of it is of frames that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
     """
     left, expected = (np.zeros_like(problem.force_n) for _ in range(2))
     part = np.arange(len(left)) * _PARTS // len(left)

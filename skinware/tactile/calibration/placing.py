@@ -10,23 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, Flags, Whole
 from skinware.tactile.calibration.shapes import Shape, fitted
 from skinware.tactile.calibration.tool import ToolErrors, compare_with_layout, regress
 
-ArrayF = npt.NDArray[np.float64]
-ArrayI = npt.NDArray[np.int64]
-
 _ROUNDS = 5
-_WRONG = 4.0
-"""Typical residuals from which a press has no weight."""
+_WRONG = 4.0  # typical residuals from which a press has no weight
 _LEAST_SPREAD_M = 0.0005
-_TYPICAL = 1.1774
-"""Median of residuals in a plane, in standard deviations."""
-_PRECISE_M = 0.0035
-"""Spread of the points below which loads count squared, which prefers the nearest taxel."""
+_TYPICAL = 1.1774  # median of residuals in a plane, in standard deviations
+_PRECISE_M = 0.0035  # spread of the points below which loads count squared, which prefers the nearest taxel
 _LEAST_PRESSES = 2
-_PARTS = 10
-"""Parts of the presses that are left out in turn, for the expected error."""
+_PARTS = 10  # parts of the presses that are left out in turn, for the expected error
 _BIAS_M, _PRECISE_BIAS_M, _BIAS_OF_SHAPES = 0.001, 0.0004, 0.6
 """Bias of places that more presses do not lower: skins end, gains differ. Shapes leave a share of it."""
 
@@ -46,19 +40,19 @@ class Placement:
         tip_m: (3,) tip of the finger that pressed, in the frame of its carrier; NaN: the points were known.
     """
 
-    position_m: ArrayF
-    normal: ArrayF
-    error_m: ArrayF
-    pressed: ArrayI
-    residual_m: ArrayF
-    wrong: npt.NDArray[np.bool_]
+    position_m: Doubles
+    normal: Doubles
+    error_m: Doubles
+    pressed: Whole
+    residual_m: Doubles
+    wrong: Flags
     tool: ToolErrors = field(default_factory=ToolErrors)
-    tip_m: ArrayF = field(default_factory=lambda: np.full(3, np.nan))
+    tip_m: Doubles = field(default_factory=lambda: np.full(3, np.nan))
 
     @property
-    def known(self) -> npt.NDArray[np.bool_]:
+    def known(self) -> Flags:
         """(n,) bool: which places are known."""
-        known: npt.NDArray[np.bool_] = np.isfinite(self.position_m[:, 0])
+        known: Flags = np.isfinite(self.position_m[:, 0])
         return known
 
     @property
@@ -73,7 +67,7 @@ def place(
     shapes: Mapping[int, Shape] | None = None,
     *,
     offset_m: float = 0.0,
-    layout_m: ArrayF | None = None,
+    layout_m: Doubles | None = None,
     is_here: bool = True,
 ) -> Placement:
     """Find the places of the taxels, and the errors of the tool.
@@ -95,10 +89,10 @@ def place(
     error = _errors(presses, trust, {}, is_precise, position)
     given, weight = presses, trust[presses.press] * presses.load
 
-    def means(of: ArrayF) -> ArrayF:
+    def means(of: Doubles) -> Doubles:
         return _means(given, weight, of)
 
-    def left(of: ArrayF) -> ArrayF:
+    def left(of: Doubles) -> Doubles:
         return of - _centres(given, means(of))
 
     tool, shift_m, tool_error_m = regress(given.pose, given.motions, trust, error, means, left)
@@ -118,7 +112,7 @@ def place(
     return Placement(position, normal, error, presses.times_pressed, residual, trust <= 0, tool)
 
 
-def _settled(presses: Presses, shapes: Mapping[int, Shape]) -> tuple[ArrayF, ArrayF, ArrayF, bool]:
+def _settled(presses: Presses, shapes: Mapping[int, Shape]) -> tuple[Doubles, Doubles, Doubles, bool]:
     """(n, 3) places, (n, 3) normals, (m,) the weight of each press, and whether points are precise."""
     position = _medians(presses)
     for _ in range(_ROUNDS):
@@ -131,7 +125,7 @@ def _settled(presses: Presses, shapes: Mapping[int, Shape]) -> tuple[ArrayF, Arr
     return position, normal, trust, is_precise
 
 
-def _places(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_precise: bool) -> tuple[ArrayF, ArrayF]:
+def _places(presses: Presses, trust: Doubles, shapes: Mapping[int, Shape], is_precise: bool) -> tuple[Doubles, Doubles]:
     """(n, 3) places, and (n, 3) normals: weighted means, and fitted shapes."""
     weight = trust[presses.press] * (presses.load**2 if is_precise else presses.load)
     position = _unbiased(presses, trust, weight) if is_precise else _means(presses, weight, presses.pose)
@@ -145,7 +139,7 @@ def _places(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_pre
     return position, normal
 
 
-def _unbiased(presses: Presses, trust: ArrayF, weight: ArrayF) -> ArrayF:
+def _unbiased(presses: Presses, trust: Doubles, weight: Doubles) -> Doubles:
     """(n, 3) places without the bias of the mean of a bell whose presses lie more to one side.
 
     The bell is as wide as the presses of a taxel typically spread; its gain does not matter.
@@ -161,7 +155,7 @@ def _unbiased(presses: Presses, trust: ArrayF, weight: ArrayF) -> ArrayF:
     return 2 * position - _means(presses, bell, presses.pose)
 
 
-def _medians(presses: Presses) -> ArrayF:
+def _medians(presses: Presses) -> Doubles:
     """(n, 3) the median of the points of each taxel's presses in each coordinate, weighted by load."""
     medians = np.full((presses.n, 3), np.nan)
     total = np.bincount(presses.taxel, presses.load, presses.n)
@@ -179,13 +173,13 @@ def _medians(presses: Presses) -> ArrayF:
     return medians
 
 
-def _residuals(presses: Presses, position: ArrayF) -> ArrayF:
+def _residuals(presses: Presses, position: Doubles) -> Doubles:
     """(m,) distance of the point of each press from the centre of the taxels that felt it; inf without any."""
     residual = np.linalg.norm(presses.pose - _centres(presses, position), axis=1)
     return np.where(np.isnan(residual), np.inf, residual)
 
 
-def _centres(presses: Presses, of: ArrayF) -> ArrayF:
+def _centres(presses: Presses, of: Doubles) -> Doubles:
     """(m, k) the means of (n, k) features over the taxels that felt each press, weighted by load; NaN without any."""
     known = np.isfinite(of[presses.taxel]).all(axis=1)
     press, taxel, load = presses.press[known], presses.taxel[known], presses.load[known]
@@ -194,17 +188,17 @@ def _centres(presses: Presses, of: ArrayF) -> ArrayF:
     return np.where(total > 0, sums, np.nan).T / np.where(total > 0, total, 1)[:, None]
 
 
-def _trust(residual: ArrayF) -> ArrayF:
+def _trust(residual: Doubles) -> Doubles:
     """(m,) 0 to 1: the weight of each press, by Tukey's biweight."""
     finite = residual[np.isfinite(residual)]
     if not len(finite):
         return np.zeros_like(residual)
     limit = _WRONG * max(float(np.median(finite)) / _TYPICAL, _LEAST_SPREAD_M)
-    trust: ArrayF = np.where(residual < limit, (1 - (np.minimum(residual, limit) / limit) ** 2) ** 2, 0.0)
+    trust: Doubles = np.where(residual < limit, (1 - (np.minimum(residual, limit) / limit) ** 2) ** 2, 0.0)
     return trust
 
 
-def _means(presses: Presses, weight: ArrayF, of: ArrayF) -> ArrayF:
+def _means(presses: Presses, weight: Doubles, of: Doubles) -> Doubles:
     """(n, k) means of (m, k) features over presses; NaN with too few presses, or felt from the side alone."""
     total = np.bincount(presses.taxel, weight, presses.n)
     count = np.bincount(presses.taxel, weight > 0, presses.n)
@@ -213,7 +207,9 @@ def _means(presses: Presses, weight: ArrayF, of: ArrayF) -> ArrayF:
     return np.where(enough[:, None], sums / np.where(enough, total, 1)[:, None], np.nan)
 
 
-def _errors(presses: Presses, trust: ArrayF, shapes: Mapping[int, Shape], is_precise: bool, position: ArrayF) -> ArrayF:
+def _errors(
+    presses: Presses, trust: Doubles, shapes: Mapping[int, Shape], is_precise: bool, position: Doubles
+) -> Doubles:
     """(n,) the expected error: the change of the places without some of the presses (jackknife), and the bias."""
     squares = []
     for left_out in range(_PARTS):
@@ -239,10 +235,10 @@ class Press:
         motion: (7,) its time, s, its velocity while it rests, m/s, and the way from which it came, of length 1.
     """
 
-    pose: ArrayF
-    taxel: ArrayI
-    load: ArrayF
-    motion: ArrayF = field(default_factory=lambda: np.full(7, np.nan))
+    pose: Doubles
+    taxel: Whole
+    load: Doubles
+    motion: Doubles = field(default_factory=lambda: np.full(7, np.nan))
 
 
 @dataclass(frozen=True)
@@ -262,11 +258,11 @@ class Presses:
     """
 
     n: int
-    pose: ArrayF
-    press: ArrayI
-    taxel: ArrayI
-    load: ArrayF
-    motion: ArrayF = field(default_factory=lambda: np.zeros((0, 7)))
+    pose: Doubles
+    press: Whole
+    taxel: Whole
+    load: Doubles
+    motion: Doubles = field(default_factory=lambda: np.zeros((0, 7)))
 
     def __post_init__(self) -> None:
         if self.motion.shape not in ((0, 7), (len(self.pose), 7)):
@@ -283,18 +279,13 @@ class Presses:
 
     @classmethod
     def none(cls, n: int, pose_shape: tuple[int, ...] = (3,)) -> Self:
-        """Make an empty set of presses on n taxels; ``pose_shape`` is the shape of a pose."""
+        """Make an empty set of presses on n taxels, with poses of this shape."""
         nothing = np.zeros(0, np.int64)
         return cls(n, np.zeros((0, *pose_shape)), nothing, nothing, np.zeros(0))
 
     @classmethod
     def of_arrays(cls, pose: npt.ArrayLike, load: npt.ArrayLike) -> Self:
-        """Make presses from whole arrays.
-
-        Args:
-            pose: (m, 3) or (m, 4, 4).
-            load: (m, n), 0 or NaN where a taxel feels nothing.
-        """
+        """Make presses from (m, 3) or (m, 4, 4) poses and (m, n) loads, 0 or NaN where a taxel feels nothing."""
         loads = np.asarray(load, np.float64)
         if loads.ndim != 2 or len(loads) != len(np.asarray(pose)):
             raise ConfigurationError(f"loads of presses: give a row of each pose, not {loads.shape}")
@@ -313,7 +304,7 @@ class Presses:
         )
 
     @property
-    def motions(self) -> ArrayF:
+    def motions(self) -> Doubles:
         """(m, 7) the time, velocity and way of each press; NaN: not known."""
         return self.motion if len(self.motion) else np.full((len(self), 7), np.nan)
 
@@ -321,7 +312,7 @@ class Presses:
         return len(self.pose)
 
     @property
-    def times_pressed(self) -> ArrayI:
+    def times_pressed(self) -> Whole:
         """(n,) number of presses that each taxel has felt at least half as much as the taxel that felt most."""
         most = np.zeros(len(self))
         np.maximum.at(most, self.press, self.load)

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
-import numpy.typing as npt
+from msgspec.structs import replace
 
 from skinware.geometry import GeometryGroup
 from skinware.structure import Structure
+from skinware.tactile.arrays import Doubles, Flags, Whole
 from skinware.tactile.calibration.placing import Placement
 from skinware.tactile.calibration.topology import Topology, unrolled_m
-
-ArrayF = npt.NDArray[np.float64]
 
 _DIGITS = 6
 
 
-def confidence_of(error_m: ArrayF, pitch_m: float) -> float:
+def confidence_of(error_m: Doubles, pitch_m: float) -> float:
     """Return the share of sensors within half a pitch of their places, if errors along the skin are normal.
 
-    Args:
-        error_m: (k,) expected error of each, root of the mean square, m.
-        pitch_m: distance between neighbours, m.
+    ``error_m`` is (k,) m, the expected error of each, root of the mean square.
     """
     within = 1 - np.exp(-((pitch_m / 2 / np.maximum(error_m, 1e-9)) ** 2))
     return round(float(within.mean()), 3)
@@ -31,35 +30,17 @@ def placed_groups(
 ) -> list[GeometryGroup]:
     """Return the groups of a geometry file, one for each module that has any place.
 
-    Args:
-        structure: structure of the skin.
-        type_name: type of the sensors.
-        placement: their places, in the order of the structure.
-        frame: coordinate frame of the poses.
-        pitch_m: distance between neighbours, for confidences.
+    Places are in the order of the structure, in the coordinate frame ``frame``; the pitch, m, is for confidences.
     """
-    return [
-        _group(
-            structure,
-            type_name,
-            module,
-            rows,
-            placement.position_m,
-            placement.normal,
-            frame,
-            confidence_of(placement.error_m[rows], pitch_m),
-        )
-        for module, rows in _by_module(structure, type_name, placement.known)
-    ]
+    found, error_m = placement, placement.error_m
+    groups = _groups(structure, type_name, found.known, found.position_m, found.normal, frame)
+    return [replace(group, confidence=confidence_of(error_m[rows], pitch_m)) for group, rows in groups]
 
 
 def unrolled_groups(structure: Structure, type_name: str, topology: Topology) -> list[GeometryGroup]:
     """Return the groups of a geometry file in which each piece of skin is a flat map of its own.
 
-    Args:
-        structure: structure of the skin.
-        type_name: type of the sensors.
-        topology: their topology, in the order of the structure.
+    The topology is in the order of the structure.
     """
     groups: list[GeometryGroup] = []
     for piece in range(topology.n_pieces):
@@ -68,10 +49,8 @@ def unrolled_groups(structure: Structure, type_name: str, topology: Topology) ->
         position = np.full((len(topology.piece), 3), np.nan)
         position[taxels, :2], position[taxels, 2] = unrolled_m(topology, taxels), 0
         normal = np.full_like(position, np.nan)
-        groups += [
-            _group(structure, type_name, module, rows, position, normal, f"piece {piece + 1}")
-            for module, rows in _by_module(structure, type_name, is_known)
-        ]
+        frame = f"piece {piece + 1}"
+        groups += [group for group, _ in _groups(structure, type_name, is_known, position, normal, frame)]
     return groups
 
 
@@ -104,31 +83,22 @@ def unrolled_comment(topology: Topology) -> str:
     )
 
 
-def _by_module(
-    structure: Structure, type_name: str, wanted: npt.NDArray[np.bool_]
-) -> list[tuple[int, npt.NDArray[np.int64]]]:
-    module = structure.module_of(type_name)
-    return [(number, np.flatnonzero(wanted & (module == number))) for number in np.unique(module[wanted]).tolist()]
-
-
-def _group(
-    structure: Structure,
-    type_name: str,
-    module: int,
-    rows: npt.NDArray[np.int64],
-    position_m: ArrayF,
-    normal: ArrayF,
-    frame: str,
-    confidence: float | None = None,
-) -> GeometryGroup:
-    uid = structure.sensor_uid[structure.index(type_name)][rows]
-    known = np.isfinite(normal[rows]).all()
-    return GeometryGroup(
-        type=type_name,
-        frame=frame,
-        uid=tuple(uid.tolist()),
-        position_m=tuple((x, y, z) for x, y, z in np.round(position_m[rows], _DIGITS).tolist()),
-        normal=tuple((x, y, z) for x, y, z in np.round(normal[rows], _DIGITS).tolist()) if known else None,
-        confidence=confidence,
-        name=structure.module_names[module],
-    )
+def _groups(
+    structure: Structure, type_name: str, wanted: Flags, position_m: Doubles, normal: Doubles, frame: str
+) -> Iterator[tuple[GeometryGroup, Whole]]:
+    """Yield a group for each module of wanted taxels, and these taxels."""
+    uid, module = structure.sensor_uid[structure.index(type_name)], structure.module_of(type_name)
+    for number in np.unique(module[wanted]).tolist():
+        rows = np.flatnonzero(wanted & (module == number))
+        places, normals = (
+            tuple((x, y, z) for x, y, z in np.round(of[rows], _DIGITS).tolist()) for of in (position_m, normal)
+        )
+        group = GeometryGroup(
+            type=type_name,
+            frame=frame,
+            uid=tuple(uid[rows].tolist()),
+            position_m=places,
+            normal=normals if np.isfinite(normal[rows]).all() else None,
+            name=structure.module_names[number],
+        )
+        yield group, rows

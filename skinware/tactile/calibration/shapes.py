@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-ArrayF = npt.NDArray[np.float64]
-ArrayI = npt.NDArray[np.int64]
+from skinware.tactile.arrays import Doubles, Whole
 
 LEAST_TAXELS = 4
 """Measured places that the pose of a module needs."""
 _OUTLIER_M = 0.002
 _ROUNDS = 5
-_FLAT = 0.02
-"""Share of the first extent of a shape below which its second makes it a line, which has no side up."""
+_FLAT = 0.02  # share of the first extent of a shape below which its second makes it a line, which has no side up
 
 
 @dataclass(frozen=True)
@@ -29,16 +27,13 @@ class Shape:
         normal: (k, 3) of length 1, NaN where it is not known.
     """
 
-    taxel: ArrayI
-    place_m: ArrayF
-    normal: ArrayF
+    taxel: Whole
+    place_m: Doubles
+    normal: Doubles
 
 
 def shapes_of(
-    module: npt.NDArray[np.integer],
-    kind: Sequence[str],
-    position_m: ArrayF,
-    normal: ArrayF,
+    module: npt.NDArray[np.integer], kind: Sequence[str], position_m: Doubles, normal: Doubles
 ) -> dict[int, Shape]:
     """Return the shapes of modules, by number, where the places of all of their taxels are known.
 
@@ -68,7 +63,7 @@ def shapes_of(
     return shapes
 
 
-def _has_extent(places: ArrayF) -> bool:
+def _has_extent(places: Doubles) -> bool:
     """Whether places determine a pose: they are neither on a line nor at one point."""
     if len(places) < LEAST_TAXELS:
         return False
@@ -78,28 +73,23 @@ def _has_extent(places: ArrayF) -> bool:
 
 @dataclass(frozen=True)
 class Pose:
-    """The pose of a module.
+    """The pose of a module: (3, 3) rotation and (3,) origin, m."""
 
-    Attributes:
-        rotation: (3, 3).
-        origin_m: (3,).
-    """
+    rotation: Doubles
+    origin_m: Doubles
 
-    rotation: ArrayF
-    origin_m: ArrayF
-
-    def places_m(self, shape: Shape) -> ArrayF:
+    def places_m(self, shape: Shape) -> Doubles:
         """Return (k, 3) the places of the taxels of a shape."""
-        places: ArrayF = shape.place_m @ self.rotation.T + self.origin_m
+        places: Doubles = shape.place_m @ self.rotation.T + self.origin_m
         return places
 
-    def normals(self, shape: Shape) -> ArrayF:
+    def normals(self, shape: Shape) -> Doubles:
         """Return (k, 3) their normals."""
-        normals: ArrayF = shape.normal @ self.rotation.T
+        normals: Doubles = shape.normal @ self.rotation.T
         return normals
 
 
-def fitted(shape: Shape, measured_m: ArrayF, weight: ArrayF) -> Pose | None:
+def fitted(shape: Shape, measured_m: Doubles, weight: Doubles) -> Pose | None:
     """Return the pose that brings a shape onto measured places; None if they are too few, or on a line.
 
     Places far from where the shape says lose their weight: 1 / (1 + (distance / 2 mm)^2), in 5 rounds.
@@ -121,7 +111,7 @@ def fitted(shape: Shape, measured_m: ArrayF, weight: ArrayF) -> Pose | None:
     return pose
 
 
-def rigid(source: ArrayF, target: ArrayF, weight: ArrayF) -> Pose:
+def rigid(source: Doubles, target: Doubles, weight: Doubles) -> Pose:
     """Return the pose that brings (k, 3) places onto others, by weighted least squares (Procrustes)."""
     share = weight / weight.sum()
     from_m, to_m = share @ source, share @ target

@@ -6,18 +6,16 @@ import math
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError, Overrun, ServiceTimeout
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 from skinware.structure import Structure
+from skinware.tactile.arrays import Doubles
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.curves import temperature_of
 from skinware.tactile.rule import UNUSABLE
-
-ArrayF = npt.NDArray[np.float64]
 
 POINT, POSE = "point_m", "pose"
 """Columns of a service of poses: (3,) or (k, 3) points, m; (4, 4) pose of the carrier of a finger, homogeneous, m."""
@@ -31,17 +29,9 @@ _PREFERRED = "pressure"
 class LoadSource:
     """The loads of the sensors of one type of a driver: 0 where nothing touches.
 
-    Values of a calmed driver pass unchanged, those of any other driver go through a baseline.
-
-    Args:
-        structure: structure of the driver.
-        driver_type: type of the driver.
-        type_name: which sensors; None: pressure, or else the driver's first type.
-
-    Attributes:
-        structure: structure of the driver.
-        type_name: which sensors.
-        temperature_c: of the newest frame; NaN: not measured.
+    Values of a calmed driver pass unchanged, those of any other driver go through a baseline. Without the name of a
+    type it is pressure, or else the driver's first type. ``temperature_c`` is that of the newest frame; NaN: not
+    measured.
 
     Raises:
         StructureError: no such type here.
@@ -72,7 +62,7 @@ class LoadSource:
         """Share of the sensors that have no baseline yet because they move."""
         return 0.0 if self._chain is None else self._chain.baselines[self.type_name].refused_share
 
-    def loads(self, frame: DriverSnapshot) -> ArrayF:
+    def loads(self, frame: DriverSnapshot) -> Doubles:
         """Return (n,) the loads in a frame; NaN where they are not known."""
         if self._chain is None:
             values, status = frame.physical(self.type_name), frame.status_of(self.type_name)
@@ -81,19 +71,14 @@ class LoadSource:
             values, status = self._values[self._index], self._status[self._index]
         self.temperature_c = temperature_of(frame)
         usable = (status & np.uint8(UNUSABLE)) == 0
-        loads: ArrayF = np.where(usable, values, np.nan).astype(np.float64)
+        loads: Doubles = np.where(usable, values, np.nan).astype(np.float64)
         return loads
 
 
 class PoseSource:
-    """Reads the newest pose of a service.
+    """Reads the newest pose of a service, from a column of points (3,) or poses (4, 4).
 
     A service may have several points and a column ``count`` of those that press: it has a pose while that is one.
-
-    Args:
-        reader: reader of the service.
-        column: column with the poses.
-        shape: (3,) for points, (4, 4) for poses.
 
     Raises:
         ConfigurationError: the service has no such column of floats.
@@ -110,7 +95,7 @@ class PoseSource:
             raise ConfigurationError(f"column {column!r} of {reader.name!r} is {found}; give {shape}, of floats")
         self._reader, self._column, self._shape = reader, column, shape
 
-    def newest(self) -> ArrayF | None:
+    def newest(self) -> Doubles | None:
         """Return the present pose; None if it is older than 0.2 s, or there is none."""
         try:
             frame = self._reader.read(timeout_s=0)
@@ -121,26 +106,22 @@ class PoseSource:
         if self._has_count and int(np.asarray(frame.column(_COUNT)).reshape(-1)[0]) != 1:
             return None
         rows = np.asarray(frame.column(self._column), np.float64).reshape(-1, *self._shape)
-        pose: ArrayF = rows[0].copy()
+        pose: Doubles = rows[0].copy()
         return pose
 
 
 class ForceSource:
     """Pairs the force of a reference with the temperature of the skin.
 
-    Args:
-        source: the loads of the skin.
-        reference: reads the force, N: (1,), or (3,), whose length counts; None: weights are typed in.
-
-    Attributes:
-        weight_n: the known weight that presses now, N; NaN: none.
+    The reference reads the force, N: (1,), or (3,), whose length counts. Without one, ``weight_n`` is the known weight
+    that presses now, N; NaN: none.
     """
 
     def __init__(self, source: LoadSource, reference: PoseSource | ForceSource | None) -> None:
         self._source, self._reference = source, reference
         self.weight_n = math.nan
 
-    def newest(self) -> ArrayF | None:
+    def newest(self) -> Doubles | None:
         """Return (2,) the present force and temperature, NaN where not known; None without a force."""
         force = np.array([self.weight_n]) if self._reference is None else self._reference.newest()
         if force is None:

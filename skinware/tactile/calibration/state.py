@@ -12,12 +12,10 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
-from skinware.tactile.array_file import Arrays, read_arrays, write_arrays
+from skinware.tactile.arrays import Arrays, Doubles, read_arrays, write_arrays
 from skinware.tactile.calibration.force import ForceData
 from skinware.tactile.calibration.placing import Press, Presses
 from skinware.tactile.calibration.topology import ENOUGH_FRAMES, StrokeSums
-
-ArrayF = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,12 +44,12 @@ class PressFinder:
 
     settings: PressSettings = field(default_factory=PressSettings)
     held: bool = False
-    _window: list[tuple[int, ArrayF, ArrayF]] = field(default_factory=list)
-    _found_at_m: ArrayF = field(default_factory=lambda: np.full(3, np.nan))
-    _passed_m: list[ArrayF] = field(default_factory=list)
+    _window: list[tuple[int, Doubles, Doubles]] = field(default_factory=list)
+    _found_at_m: Doubles = field(default_factory=lambda: np.full(3, np.nan))
+    _passed_m: list[Doubles] = field(default_factory=list)
     """The last two points of its way that are apart by more than it may move while it rests."""
 
-    def update(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> Press | None:
+    def update(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> Press | None:
         """Take a frame, and return the press that is complete with it.
 
         Args:
@@ -92,41 +90,31 @@ class PressFinder:
         taxel = np.flatnonzero(mean > 0)
         return Press(at, taxel, mean[taxel], motion)
 
-    def _follow(self, pose: ArrayF | None) -> None:
+    def _follow(self, pose: Doubles | None) -> None:
         if pose is None or not np.isfinite(pose).all():
             self._passed_m.clear()
         elif not self._passed_m or np.linalg.norm(_point(pose) - self._passed_m[-1]) > self.settings.still_m:
             self._passed_m = [*self._passed_m[-1:], _point(pose).copy()]
 
 
-def _point(pose: ArrayF) -> ArrayF:
+def _point(pose: Doubles) -> Doubles:
     """(3,) the point, or the origin of the pose."""
-    point: ArrayF = pose if pose.ndim == 1 else pose[:3, 3]
+    point: Doubles = pose if pose.ndim == 1 else pose[:3, 3]
     return point
 
 
 class Session(ABC):
-    """Gathers presses or strokes until enough taxels are covered.
-
-    Attributes:
-        kind: its name in files.
-    """
+    """Gathers presses or strokes until enough taxels are covered; ``kind`` is its name in files."""
 
     kind: str
 
     @abstractmethod
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
-        """Take a frame.
-
-        Args:
-            time_ns: time of the frame.
-            load: (n,) 0 where nothing touches, NaN where it is not known.
-            pose: pose at that time, if this session needs one; None: not known.
-        """
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
+        """Take a frame, as :meth:`PressFinder.update` does; the pose counts where this session needs one."""
 
     @property
     @abstractmethod
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         """(n,) 0 to 1: how complete each taxel is."""
 
     @property
@@ -140,19 +128,14 @@ class Session(ABC):
 
     @abstractmethod
     def restore(self, arrays: Arrays) -> None:
-        """Go on with the presses or strokes of an equal session.
-
-        Raises:
-            ConfigurationError, KeyError, ValueError: the arrays do not fit.
-        """
+        """Go on with the arrays of an equal session; raises ConfigurationError, KeyError or ValueError at others."""
 
     def is_complete(self, share: float) -> bool:
-        """Return whether at least this share of the taxels is complete."""
         return bool((self.coverage >= 1).mean() >= share)
 
 
 class PressSession(Session):
-    """Gathers presses.
+    """Gathers presses on n taxels.
 
     Args:
         n: number of taxels.
@@ -165,24 +148,20 @@ class PressSession(Session):
     """
 
     def __init__(
-        self,
-        n: int,
-        wanted: int = 5,
-        pose_shape: tuple[int, ...] = (3,),
-        settings: PressSettings | None = None,
+        self, n: int, wanted: int = 5, pose_shape: tuple[int, ...] = (3,), settings: PressSettings | None = None
     ) -> None:
         self.kind = "points" if pose_shape == (3,) else "poses"
         self._n, self._wanted, self._pose_shape = n, wanted, pose_shape
         self._finder = PressFinder(settings or PressSettings())
         self.presses = Presses.none(n, pose_shape)
 
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
         press = self._finder.update(time_ns, load, pose)
         if press is not None:
             self.presses = self.presses.with_press(press)
 
     @property
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         return np.minimum(self.presses.times_pressed / self._wanted, 1.0)
 
     @property
@@ -200,26 +179,19 @@ class PressSession(Session):
 
 
 class StrokeSession(Session):
-    """Gathers strokes.
-
-    Args:
-        n: number of taxels.
-
-    Raises:
-        ConfigurationError: there are too many for a topology.
-    """
+    """Gathers strokes over n taxels; raises ConfigurationError if they are too many for a topology."""
 
     kind = "strokes"
 
     def __init__(self, n: int) -> None:
         self.sums = StrokeSums.empty(n)
 
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
         del time_ns, pose  # strokes need neither
         self.sums.add(load)
 
     @property
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         return np.minimum(self.sums.active / ENOUGH_FRAMES, 1.0)
 
     @property
@@ -245,19 +217,15 @@ class StrokeSession(Session):
 
 
 class ForceSession(Session):
-    """Gathers loads beside a reference: a force in N, and the temperature of the skin.
-
-    Args:
-        n: number of taxels.
-    """
+    """Gathers loads of n taxels beside a reference: a force in N, and the temperature of the skin."""
 
     kind = "forces"
 
     def __init__(self, n: int) -> None:
         self._n = n
-        self._frames: list[tuple[float, ArrayF, ArrayF]] = []
+        self._frames: list[tuple[float, Doubles, Doubles]] = []
 
-    def take(self, time_ns: int, load: npt.NDArray[Any], pose: ArrayF | None) -> None:
+    def take(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> None:
         if pose is not None and np.isfinite(pose[0]):
             self._frames.append((time_ns / NS_PER_S, np.nan_to_num(load), pose))
 
@@ -269,7 +237,7 @@ class ForceSession(Session):
         return ForceData(np.array([time_s for time_s, *_ in self._frames]), loads, force_n, temperature_c)
 
     @property
-    def coverage(self) -> ArrayF:
+    def coverage(self) -> Doubles:
         pressed = np.zeros(self._n)
         for _, load, _ in self._frames:
             pressed += load > 0
@@ -300,29 +268,13 @@ _ARRAYS = "gathered/"
 
 
 def save_session(path: Path, session: Session, type_name: str, uid: npt.NDArray[np.uint64]) -> None:
-    """Write the presses or strokes of a session.
-
-    Args:
-        path: path of the file.
-        session: the session.
-        type_name: type of its taxels.
-        uid: (n,) uids of its taxels.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write the presses or strokes of a session over (n,) taxels of a type; raises OSError."""
     head = {"kind": np.array(session.kind), "type_name": np.array(type_name), "uid": uid}
     write_arrays(path, _VERSION, head | {f"{_ARRAYS}{name}": array for name, array in session.arrays().items()})
 
 
 def restore_session(path: Path, session: Session, type_name: str, uid: npt.NDArray[np.uint64]) -> bool:
-    """Go on with the presses or strokes of a file; return False if there is no such file.
-
-    Args:
-        path: path of the file.
-        session: a new one.
-        type_name: type of its taxels.
-        uid: (n,) uids of its taxels.
+    """Go on with the presses or strokes of a file, in a new session; return False if there is no such file.
 
     Raises:
         ConfigurationError: it is no such file, of other taxels, or of another kind of session.

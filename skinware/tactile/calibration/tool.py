@@ -12,31 +12,23 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from skinware.tactile.arrays import Doubles, Whole
 from skinware.tactile.calibration.shapes import rigid
 
-ArrayF = npt.NDArray[np.float64]
-ArrayI = npt.NDArray[np.int64]
-Smoother = Callable[[ArrayF], ArrayF]
+Smoother = Callable[[Doubles], Doubles]
 
 DRIFT, LAG, PLAY, SCALE, OFFSET = "drift", "lag", "play", "scale", "offset"
 KINDS = (DRIFT, LAG, PLAY, SCALE, OFFSET)
 
-_SURE = 4.0
-"""Standard errors from which an error of the tool is reported."""
-_INFLATION = 1.25
-"""Times a standard error: presses beside each other share the errors of their taxels."""
-_LEAST_M = 0.0003
-"""Effect on a point below which no error of the tool is reported, m."""
-_KNOTS, _PRESSES_A_KNOT = 6, 60
-"""Pieces of a drift that is not even, and presses that each needs."""
+_SURE = 4.0  # standard errors from which an error of the tool is reported
+_INFLATION = 1.25  # times a standard error: presses beside each other share the errors of their taxels
+_LEAST_M = 0.0003  # effect on a point below which no error of the tool is reported, m
+_KNOTS, _PRESSES_A_KNOT = 6, 60  # pieces of a drift that is not even, and presses that each needs
 _FINER = 3
-_UNEVEN = 3.0
-"""Times the spread by chance: what finer pieces may explain of the residuals without any reason."""
+_UNEVEN = 3.0  # times the spread by chance: what finer pieces may explain of the residuals without any reason
 _ROUNDS = 3
-_LEAST_REST = 0.01
-"""Share of a feature that places of taxels must leave, or it is one with them."""
+_LEAST_REST = 0.01  # share of a feature that places of taxels must leave, or it is one with them
 _FEWEST = 30
 _LEAST_MODULES = 4
 _MM, _MINUTE_S = 1e3, 60.0
@@ -44,11 +36,11 @@ _MM, _MINUTE_S = 1e3, 60.0
 
 @dataclass(frozen=True)
 class ToolErrors:
-    """The errors of a tool, as far as presses show them.
+    """The errors of a tool, as far as presses show them, in words.
 
     Attributes:
-        found: errors that were found and corrected, in words.
-        doubts: errors that were found and cannot be corrected, in words; none: the places can be trusted.
+        found, doubts: errors that were found and corrected, and those that cannot be; without doubts places can be
+            trusted.
         unchecked: errors that would not show: by how much each may move the places, m; infinite: by any way.
     """
 
@@ -67,17 +59,15 @@ class ToolErrors:
 
 
 def regress(
-    point_m: ArrayF, motion: ArrayF, trust: ArrayF, error_m: ArrayF, means: Smoother, left: Smoother
-) -> tuple[ToolErrors, ArrayF, ArrayF]:
+    point_m: Doubles, motion: Doubles, trust: Doubles, error_m: Doubles, means: Smoother, left: Smoother
+) -> tuple[ToolErrors, Doubles, Doubles]:
     """Find drift, lag and play.
 
     Args:
-        point_m: (m, 3) the points of m presses.
-        motion: (m, 7) time, velocity and way of each, as of a :class:`.placing.Press`.
-        trust: (m,) the weight of each.
+        point_m, motion, trust: (m, ...) points of m presses, their motion as of a :class:`.placing.Press`, and weights.
         error_m: (n,) error of the places by chance; an error of the tool that is less certain is left alone.
         means: makes (n, k) of (m, k): the means of presses over the taxels that felt them.
-        left: makes (m, k) of (m, k): what differs from the centre of those means.
+        left: makes (m, k) of (m, k): how they differ from the centre of those means.
 
     Returns:
         The errors, (m, 3) m by which each point is off as far as it was found, and (n,) m the standard error of that in
@@ -113,14 +103,14 @@ def regress(
     return _concluded(fit, time_s, most_m, means, doubts)
 
 
-def _pieces(time_s: ArrayF, pieces: int) -> ArrayF:
+def _pieces(time_s: Doubles, pieces: int) -> Doubles:
     """(3 * pieces, m, 3): a line of even pieces over time, from 0 at the first press, in each axis."""
     known = time_s[np.isfinite(time_s)]
     if not len(known):
         return np.full((3, len(time_s), 3), np.nan)
     knots = np.linspace(known.min(), known.max(), pieces + 1)
     hats = np.array([np.interp(time_s, knots, of) for of in np.eye(pieces + 1)[1:]])
-    found: ArrayF = (hats[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(-1, len(time_s), 3)
+    found: Doubles = (hats[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(-1, len(time_s), 3)
     return found
 
 
@@ -128,15 +118,14 @@ def _pieces(time_s: ArrayF, pieces: int) -> ArrayF:
 class _Fit:
     """A robust least-squares fit of terms (p, m, 3) to residuals (m, 3)."""
 
-    terms: dict[str, ArrayF]
-    weights: ArrayF
-    covariance: ArrayF
-    cost: float
-    """Mean square of what is left, in each axis, m^2."""
+    terms: dict[str, Doubles]
+    weights: Doubles
+    covariance: Doubles
+    cost: float  # mean square of what is left, in each axis, m^2
     counting: float
 
     @classmethod
-    def of(cls, terms: dict[str, ArrayF], residual: ArrayF, trust: ArrayF, left: Smoother) -> _Fit:
+    def of(cls, terms: dict[str, Doubles], residual: Doubles, trust: Doubles, left: Smoother) -> _Fit:
         features = np.array([np.nan_to_num(left(feature)) for term in terms.values() for feature in term])
         residual = np.nan_to_num(residual)
         size = np.maximum(np.sqrt((features**2).mean(axis=(1, 2))), 1e-9)
@@ -164,9 +153,9 @@ class _Fit:
 
 
 def _concluded(
-    fit: _Fit, time_s: ArrayF, most_m: float, means: Smoother, doubts: list[str]
-) -> tuple[ToolErrors, ArrayF, ArrayF]:
-    shift: ArrayF = np.zeros((len(time_s), 3))
+    fit: _Fit, time_s: Doubles, most_m: float, means: Smoother, doubts: list[str]
+) -> tuple[ToolErrors, Doubles, Doubles]:
+    shift: Doubles = np.zeros((len(time_s), 3))
     error2 = 0.0 * means(shift)[:, 0]
     found: list[str] = []
     unchecked = dict.fromkeys(KINDS, math.inf)
@@ -191,7 +180,7 @@ def _concluded(
     return ToolErrors(tuple(found), tuple(doubts), unchecked), shift, np.sqrt(np.nan_to_num(error2))
 
 
-def _words(kind: str, weights: ArrayF, effect: ArrayF, time_s: ArrayF, most_m: float) -> str:
+def _words(kind: str, weights: Doubles, effect: Doubles, time_s: Doubles, most_m: float) -> str:
     if kind == LAG:
         return f"the points lag {-float(weights[0]):.2f} s behind the skin: take the times of both from one clock"
     if kind == PLAY:
@@ -206,16 +195,21 @@ def _words(kind: str, weights: ArrayF, effect: ArrayF, time_s: ArrayF, most_m: f
 
 
 def compare_with_layout(
-    tool: ToolErrors, position_m: ArrayF, layout_m: ArrayF, modules: Iterable[ArrayI], error_m: ArrayF, *, is_here: bool
+    tool: ToolErrors,
+    position_m: Doubles,
+    layout_m: Doubles,
+    modules: Iterable[Whole],
+    error_m: Doubles,
+    *,
+    is_here: bool,
 ) -> ToolErrors:
     """Return what is known of the tool, with its scale and offset by a layout.
 
     Args:
-        tool: what is known.
-        position_m: (n, 3) places.
-        layout_m: (n, 3) places of the layout, in one coordinate frame; NaN where it has none.
+        tool: the errors that are known.
+        position_m, layout_m: (n, 3) places, and those of the layout, in one coordinate frame; NaN where it has none.
         modules: the taxels of each module: modules are compared as a whole.
-        error_m: (n,) standard error of all places together by what was corrected.
+        error_m: (n,) standard error of all places together by the corrections.
         is_here: whether the layout is in the coordinate frame of the points.
     """
     whole = [taxels for taxels in modules if np.isfinite(position_m[taxels] + layout_m[taxels]).all()]

@@ -9,16 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, Flags, Whole
 from skinware.tactile.neighbours import Components, neighbours_of_pairs
-
-ArrayF = npt.NDArray[np.float64]
 
 MOST_TAXELS = 6000
 """Every taxel is compared with every other one: this many need 290 MB."""
 ENOUGH_FRAMES = 20
 """Frames with a touch after which a taxel is covered."""
-_LEAST_FRAMES = 8
-"""Frames with a touch from which a taxel counts: in fewer it may be noise."""
+_LEAST_FRAMES = 8  # frames with a touch from which a taxel counts: in fewer it may be noise
 
 
 @dataclass
@@ -31,17 +29,13 @@ class StrokeSums:
         frames: number of frames in which any was touched.
     """
 
-    products: ArrayF
-    active: npt.NDArray[np.int64]
+    products: Doubles
+    active: Whole
     frames: int = 0
 
     @classmethod
     def empty(cls, n: int) -> Self:
-        """Make the sums of n taxels before the first frame.
-
-        Raises:
-            ConfigurationError: there are too many.
-        """
+        """Make the sums of n taxels before the first frame; raises ConfigurationError if there are too many."""
         if n > MOST_TAXELS:
             raise ConfigurationError(f"{n} taxels: a topology is found of at most {MOST_TAXELS} at a time")
         return cls(np.zeros((n, n)), np.zeros(n, np.int64))
@@ -50,11 +44,7 @@ class StrokeSums:
         return len(self.active)
 
     def add(self, load: npt.NDArray[Any]) -> None:
-        """Take one frame or many.
-
-        Args:
-            load: (n,) or (m, n): 0 where nothing touches, NaN where it is not known.
-        """
+        """Take one frame or many: (n,) or (m, n) loads, 0 where nothing touches, NaN where it is not known."""
         loads = np.nan_to_num(np.atleast_2d(np.asarray(load, np.float64)), posinf=0.0)
         np.maximum(loads, 0, out=loads)
         loads = loads[(loads > 0).any(axis=1)]
@@ -67,31 +57,26 @@ class StrokeSums:
         self.frames += len(loads)
 
     @property
-    def known(self) -> npt.NDArray[np.bool_]:
+    def known(self) -> Flags:
         """(n,) bool: touched in enough frames to be compared with others."""
         return self.active >= _LEAST_FRAMES
 
-    def similarity(self) -> ArrayF:
+    def similarity(self) -> Doubles:
         """Return (n, n), 0 to 1: the cosine between the loads of two taxels over time; 0 if one is not known."""
         length = np.sqrt(np.diag(self.products))
         known = self.known & (length > 0)
         scale = np.where(known, 1 / np.where(known, length, 1), 0)
-        similarity: ArrayF = np.clip(self.products * scale[:, None] * scale, 0, 1)
+        similarity: Doubles = np.clip(self.products * scale[:, None] * scale, 0, 1)
         return similarity
 
 
-ArrayI = npt.NDArray[np.int64]
-
 PITCH_M = 0.0065
 """Pitch of ROBOSKIN, m."""
-_LEAST_SIMILAR = 0.05
-"""Similarity below which the tail of a bell is noise."""
-_BESIDE = 1.6
-"""Pitches within which taxels are neighbours: between two rings of a lattice of triangles."""
+_LEAST_SIMILAR = 0.05  # similarity below which the tail of a bell is noise
+_BESIDE = 1.6  # pitches within which taxels are neighbours: between two rings of a lattice of triangles
 _TOGETHER = 0.012
 """Similarity of taxels of one piece: more even on a strip that was hardly stroked, while noise makes less."""
-_NEAREST = 3
-"""Nearest taxels that are typically a pitch away: six in a lattice of triangles, three at its edge."""
+_NEAREST = 3  # nearest taxels that are typically a pitch away: six in a lattice of triangles, three at its edge
 
 
 @dataclass(frozen=True)
@@ -106,30 +91,25 @@ class Topology:
             felt between this part and the others of the piece to say where they are.
     """
 
-    pairs: ArrayI
-    distance_m: ArrayF
-    piece: ArrayI
-    linked: npt.NDArray[np.bool_]
+    pairs: Whole
+    distance_m: Doubles
+    piece: Whole
+    linked: Flags
 
     @property
     def n_pieces(self) -> int:
         """Number of pieces."""
         return int(self.piece.max(initial=-1)) + 1
 
-    def geodesics_m(self, taxels: ArrayI) -> ArrayF:
+    def geodesics_m(self, taxels: Whole) -> Doubles:
         """Return (k, k) the shortest ways between k taxels over measured distances, m; inf where there is none."""
-        ways: ArrayF = self.distance_m[np.ix_(taxels, taxels)].copy()
+        ways: Doubles = self.distance_m[np.ix_(taxels, taxels)].copy()
         np.fill_diagonal(ways, 0)
         return shortest_m(ways)
 
 
 def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
-    """Compute the topology of a skin from strokes.
-
-    Args:
-        sums: sums of the strokes.
-        pitch_m: distance between the nearest taxels, m.
-    """
+    """Compute the topology of a skin from strokes; the pitch is the distance between the nearest taxels, m."""
     similarity = sums.similarity()
     with np.errstate(divide="ignore"):
         far = np.where(similarity > _LEAST_SIMILAR, np.sqrt(-np.log(similarity)), np.inf)
@@ -156,7 +136,7 @@ def topology_of(sums: StrokeSums, pitch_m: float = PITCH_M) -> Topology:
     return Topology(np.column_stack([one, other]), distance, piece, linked)
 
 
-def shortest_m(distance_m: ArrayF) -> ArrayF:
+def shortest_m(distance_m: Doubles) -> Doubles:
     """Return (k, k) the shortest ways over a (k, k) table of distances with a diagonal of 0; inf: there is none."""
     ways = distance_m.copy()
     for between in range(len(ways)):
@@ -165,21 +145,15 @@ def shortest_m(distance_m: ArrayF) -> ArrayF:
 
 
 _ROUNDS = 200
-_ENOUGH = 1e-5
-"""Share of the stress by which a round must lower it."""
-_FAR_WEIGHT = 0.002
-"""Weight of a way over several taxels, relative to a measured distance of the same length."""
+_ENOUGH = 1e-5  # share of the stress by which a round must lower it
+_FAR_WEIGHT = 0.002  # weight of a way over several taxels, relative to a measured distance of the same length
 
 
-def unrolled_m(topology: Topology, taxels: ArrayI) -> ArrayF:
-    """Return (k, 2) places of k taxels of one piece on a map, m, with their mean at 0. It may be the mirror image.
+def unrolled_m(topology: Topology, taxels: Whole) -> Doubles:
+    """Return (k, 2) places of (k,) linked taxels of one piece on a map, m, with mean 0. It may be the mirror image.
 
     Classical multidimensional scaling of the ways along the skin, then majorisation of the stress, in which measured
     distances count most.
-
-    Args:
-        topology: their topology.
-        taxels: (k,) linked taxels of one piece.
     """
     ways = topology.geodesics_m(taxels)
     if len(taxels) == 1:
@@ -196,7 +170,7 @@ def unrolled_m(topology: Topology, taxels: ArrayI) -> ArrayF:
     return _majorised(places, ways, weight)
 
 
-def _majorised(places: ArrayF, ways: ArrayF, weight: ArrayF) -> ArrayF:
+def _majorised(places: Doubles, ways: Doubles, weight: Doubles) -> Doubles:
     laplacian = np.diag(weight.sum(axis=1)) - weight
     inverse = np.linalg.pinv(laplacian, hermitian=True)
     stress = np.inf
@@ -208,5 +182,5 @@ def _majorised(places: ArrayF, ways: ArrayF, weight: ArrayF) -> ArrayF:
         pull = -weight * ways / np.where(distance > 0, distance, np.inf)
         np.fill_diagonal(pull, -pull.sum(axis=1))
         places = inverse @ (pull @ places)
-    centred: ArrayF = places - places.mean(axis=0)
+    centred: Doubles = places - places.mean(axis=0)
     return centred

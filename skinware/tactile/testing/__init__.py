@@ -1,13 +1,6 @@
 """Simulate a skin with places, somebody who presses it, and the faults of real skins, as a truth to test against.
 
-It gives arrays, so that an algorithm can be compared with the load that no real skin knows::
-
-    from skinware.tactile.testing import World, grid
-
-    world = World(grid(modules=10), seed=1, drift_per_min=0.5, noise=0.8)
-    world.push(world.surface.position_m[5], 25, begin_s=10, end_s=20)
-    for sample in world.samples(until_s=30):
-        sample.values, sample.truth  # (n,) both
+It gives arrays, so that an algorithm can be compared with the load that no real skin knows: docs/tactile/world.md.
 """
 
 from skinware.tactile.testing.gestures import Cover, Gesture, Play, Push, Stroke, Wander, read_stage

@@ -1,23 +1,6 @@
 """Press a simulated skin with gestures, forces over time at places that may move; read them from a stage file.
 
-::
-
-    format = "skinware-stage"
-    version = 1
-    repeat_s = 12.0                     # it begins again after this time; optional: default once
-
-    [[push]]
-    at_m = [0.07, 0.0225, 0.0]
-    force_n = 3.0
-    begin_s = 1.0
-    end_s = 4.0
-
-    [[stroke]]
-    path_m = [[0.02, 0.0225, 0.0], [0.12, 0.0225, 0.0]]
-    force_n = 4.0
-    begin_s = 5.0
-    end_s = 9.0
-    radius_m = 0.006                    # and rise_s, fall_s, name, as for Gesture
+docs/tactile/world.md has an example of the file, which is TOML.
 """
 
 from __future__ import annotations
@@ -29,13 +12,11 @@ from typing import Annotated, TypedDict
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.tactile.arrays import Doubles, Whole
 from skinware.tactile.testing.surface import Surface
 from skinware.toml_text import TomlText
-
-ArrayF = npt.NDArray[np.float64]
 
 
 class How(TypedDict, total=False):
@@ -85,52 +66,45 @@ class Gesture(ABC):
             return self.fall_s
         return max(min(self.rise_s, self.end_s - self.begin_s - self.rise_s), 0.0)
 
-    def forces(self, time_s: ArrayF) -> ArrayF:
+    def forces(self, time_s: Doubles) -> Doubles:
         """Return (m,) the force at m times."""
         points = np.array([self.begin_s, self.begin_s + self.rise_s, self.end_s - self.falls_s, self.end_s])
         full = np.interp(time_s, points, [0.0, 1.0, 1.0, 0.0], left=0.0, right=0.0)
         on = (time_s >= self.begin_s) & (time_s < self.end_s)
-        forces: ArrayF = self.force * full * on
+        forces: Doubles = self.force * full * on
         return forces
 
     @abstractmethod
-    def points_m(self, time_s: ArrayF) -> ArrayF:
+    def points_m(self, time_s: Doubles) -> Doubles:
         """Return (m, 3) its place at m times, m; NaN if it has none."""
 
-    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:  # noqa: ARG002
+    def distances_m(self, time_s: Doubles, surface: Surface, taxels: Whole) -> Doubles:  # noqa: ARG002
         """Return (m, k) or (1, k) the distances of k taxels from it at m times, m; NaN or inf: out of reach."""
         return self.least_distances_m(surface)[taxels][np.newaxis]  # it does not move
 
     @abstractmethod
-    def least_distances_m(self, surface: Surface) -> ArrayF:
+    def least_distances_m(self, surface: Surface) -> Doubles:
         """Return (n,) how near it ever comes to each taxel, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Push(Gesture):
-    """A force at one point.
-
-    Attributes:
-        at_m: x, y, z, m.
-    """
+    """A force at one point, x, y, z, m."""
 
     at_m: tuple[float, float, float]
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:
+    def points_m(self, time_s: Doubles) -> Doubles:
         return np.broadcast_to(np.array(self.at_m, np.float64), (len(time_s), 3))
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:
+    def least_distances_m(self, surface: Surface) -> Doubles:
         distance = np.linalg.norm(surface.position_m - np.array(self.at_m), axis=1)
-        beyond: ArrayF = np.maximum(distance - self.radius_m, 0)
+        beyond: Doubles = np.maximum(distance - self.radius_m, 0)
         return beyond
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stroke(Gesture):
-    """A force that moves along a line of points, at one speed.
-
-    Attributes:
-        path_m: at least two points, x, y, z, m.
+    """A force that moves along a line of points, x, y, z, m, at one speed.
 
     Raises:
         ConfigurationError: fewer than two points.
@@ -143,34 +117,34 @@ class Stroke(Gesture):
         if len(self.path_m) < 2:
             raise ConfigurationError("a stroke needs a path of at least two points")
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:
+    def points_m(self, time_s: Doubles) -> Doubles:
         path, length = self._line()
         return _along(path, length, (time_s - self.begin_s) / (self.end_s - self.begin_s) * length[-1])
 
-    def distances_m(self, time_s: ArrayF, surface: Surface, taxels: npt.NDArray[np.int64]) -> ArrayF:
+    def distances_m(self, time_s: Doubles, surface: Surface, taxels: Whole) -> Doubles:
         away = self.points_m(time_s)[:, np.newaxis] - surface.position_m[taxels]
-        distance: ArrayF = np.maximum(np.linalg.norm(away, axis=2) - self.radius_m, 0)
+        distance: Doubles = np.maximum(np.linalg.norm(away, axis=2) - self.radius_m, 0)
         return distance
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:
+    def least_distances_m(self, surface: Surface) -> Doubles:
         return self._least(surface, self._line()[0])
 
-    def _line(self, *, closed: bool = False) -> tuple[ArrayF, ArrayF]:
+    def _line(self, *, closed: bool = False) -> tuple[Doubles, Doubles]:
         """(k, 3) the points, and (k,) the length of the line up to each of them."""
         path = np.array(self.path_m + self.path_m[: int(closed)], np.float64)
         return path, np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
 
-    def _least(self, surface: Surface, path: ArrayF) -> ArrayF:
+    def _least(self, surface: Surface, path: Doubles) -> Doubles:
         least = np.full(len(surface), np.inf)
         for start, way in zip(path, np.diff(path, axis=0), strict=False):
             from_start = surface.position_m - start
             part = np.clip(from_start @ way / max(float(way @ way), 1e-18), 0, 1)
             np.fmin(least, np.linalg.norm(from_start - part[:, np.newaxis] * way, axis=1), out=least)
-        nearest: ArrayF = np.maximum(least - self.radius_m, 0)
+        nearest: Doubles = np.maximum(least - self.radius_m, 0)
         return nearest
 
 
-def _along(path: ArrayF, length: ArrayF, way: ArrayF) -> ArrayF:
+def _along(path: Doubles, length: Doubles, way: Doubles) -> Doubles:
     return np.stack([np.interp(way, length, path[:, axis]) for axis in range(3)], axis=1)
 
 
@@ -188,36 +162,32 @@ class Wander(Stroke):
     press_s: float = 2.6
     pause_s: float = 1.4
 
-    def forces(self, time_s: ArrayF) -> ArrayF:
+    def forces(self, time_s: Doubles) -> Doubles:
         since_s = time_s - self.begin_s
         moment_s = since_s % (self.press_s + self.pause_s)
         points = np.array([0, self.rise_s, self.press_s - self.falls_s, self.press_s])
         full = np.interp(moment_s, points, [0.0, 1.0, 1.0, 0.0], right=0.0)
-        forces: ArrayF = self.force * full * ((since_s >= 0) & (time_s < self.end_s))
+        forces: Doubles = self.force * full * ((since_s >= 0) & (time_s < self.end_s))
         return forces
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:
+    def points_m(self, time_s: Doubles) -> Doubles:
         path, length = self._line(closed=True)
         return _along(path, length, (time_s - self.begin_s) * self.speed_m_s % length[-1])
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:
+    def least_distances_m(self, surface: Surface) -> Doubles:
         return self._least(surface, self._line(closed=True)[0])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cover(Gesture):
-    """An even load on given taxels, wherever they are: a hand that lies on a module.
-
-    Attributes:
-        taxels: their numbers.
-    """
+    """An even load on given taxels, by their numbers, wherever they are: a hand that lies on a module."""
 
     taxels: tuple[int, ...]
 
-    def points_m(self, time_s: ArrayF) -> ArrayF:
+    def points_m(self, time_s: Doubles) -> Doubles:
         return np.full((len(time_s), 3), np.nan)
 
-    def least_distances_m(self, surface: Surface) -> ArrayF:
+    def least_distances_m(self, surface: Surface) -> Doubles:
         distance = np.full(len(surface), np.inf)
         distance[list(self.taxels)] = 0
         return distance
@@ -254,12 +224,7 @@ class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Play:
-    """The gestures of a stage file.
-
-    Attributes:
-        gestures: forces in N.
-        repeat_s: everything begins again after this time; None: it happens once.
-    """
+    """The gestures of a stage file, forces in N; everything begins again after ``repeat_s``, None: it happens once."""
 
     gestures: tuple[Gesture, ...]
     repeat_s: float | None

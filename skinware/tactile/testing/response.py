@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
+from skinware.tactile.arrays import Doubles, Flags, Whole
 
-ArrayF = npt.NDArray[np.float64]
-_FAR = 5.0
-"""Widths beyond which nothing is felt."""
+_FAR = 5.0  # widths beyond which nothing is felt
 
 
 @dataclass(frozen=True)
@@ -48,28 +46,22 @@ class Response:
         """Distance from a contact beyond which nothing changes, m."""
         return _FAR * self.width_m if self.sag == 0 else max(_FAR * self.width_m, 4 * self.sag_radius_m)
 
-    def bell(self, distance_m: ArrayF) -> ArrayF:
+    def bell(self, distance_m: Doubles) -> Doubles:
         """Return the share of the force that is felt as load, at distances; 0 at NaN."""
         near = distance_m <= _FAR * self.width_m
-        load: ArrayF = np.where(near, np.exp(-0.5 * (np.where(near, distance_m, 0) / self.width_m) ** 2), 0.0)
+        load: Doubles = np.where(near, np.exp(-0.5 * (np.where(near, distance_m, 0) / self.width_m) ** 2), 0.0)
         return load
 
-    def ring(self, distance_m: ArrayF) -> ArrayF:
+    def ring(self, distance_m: Doubles) -> Doubles:
         """Return the share of the force that is missing round it, at distances; 0 at NaN."""
         squared = np.where(distance_m <= 4 * self.sag_radius_m, distance_m / self.sag_radius_m, 0) ** 2
-        missing: ArrayF = self.sag * squared * np.exp(1 - squared)
+        missing: Doubles = self.sag * squared * np.exp(1 - squared)
         return missing
 
-    def slowly(self, load: ArrayF, crept: ArrayF, period_s: float) -> ArrayF:
-        """Return what creep and remainder add to a block of loads.
+    def slowly(self, load: Doubles, crept: Doubles, period_s: float) -> Doubles:
+        """Return (m, k) what creep and remainder add to a block of (m, k) loads, one each ``period_s``.
 
-        Args:
-            load: (m, k) at even times.
-            crept: (k,) the load that the material is used to; updated.
-            period_s: between the rows.
-
-        Returns:
-            (m, k).
+        ``crept``, (k,) the load that the material is used to, is updated.
         """
         gain = 1 - np.exp(-period_s / self.creep_s)
         used_to = np.empty_like(load)
@@ -79,22 +71,11 @@ class Response:
         return self.creep * np.minimum(used_to, load) + self.remainder * np.maximum(used_to - load, 0)
 
 
-ArrayI = npt.NDArray[np.int64]
-
-
 @dataclass(frozen=True)
 class Missing:
-    """Taxels without data for a while.
+    """Taxels without data for a while: their status meanwhile, and a value; None: the last one (0 before the first)."""
 
-    Attributes:
-        taxels: (k,) their numbers.
-        begin_s: from then on.
-        end_s: until then.
-        status: their status meanwhile.
-        value: value in their place; None: the last one (before the first frame: 0).
-    """
-
-    taxels: ArrayI
+    taxels: Whole
     begin_s: float
     end_s: float
     status: Status
@@ -103,16 +84,9 @@ class Missing:
 
 @dataclass(frozen=True)
 class Jump:
-    """A board that moved its baseline.
+    """A board that moves its baseline by counts, and is ``SUSPECT`` for a while; 0: its driver notices nothing."""
 
-    Attributes:
-        taxels: (k,) their numbers.
-        counts: by which the values move.
-        at_s: when.
-        suspect_s: for how long their status is ``SUSPECT``; 0 if the driver does not notice.
-    """
-
-    taxels: ArrayI
+    taxels: Whole
     counts: float
     at_s: float
     suspect_s: float
@@ -127,14 +101,13 @@ class Faults:
         noise: (n,) factor on its noise.
         stuck: (n,) the value that a taxel always shows; NaN: it is not stuck.
         source: (n,) the taxel whose data arrives in each one's place.
-        missing: gaps.
-        jumps: jumps.
+        missing, jumps: gaps and jumps.
     """
 
-    feels: npt.NDArray[np.bool_]
-    noise: ArrayF
-    stuck: ArrayF
-    source: ArrayI
+    feels: Flags
+    noise: Doubles
+    stuck: Doubles
+    source: Whole
     missing: list[Missing] = field(default_factory=list)
     jumps: list[Jump] = field(default_factory=list)
 
@@ -142,12 +115,10 @@ class Faults:
     def none(cls, n: int) -> Faults:
         return cls(np.ones(n, bool), np.ones(n), np.full(n, np.nan), np.arange(n))
 
-    def jumped(self, time_s: ArrayF, patch: ArrayI) -> tuple[ArrayF | None, npt.NDArray[np.bool_] | None]:
-        """Return (m, n) what jumps add to the values, and (m, n) which are suspect; None if there is no jump yet.
+    def jumped(self, time_s: Doubles, patch: Whole) -> tuple[Doubles | None, Flags | None]:
+        """Return (m, n) how jumps change the values, and (m, n) which are suspect; None if there is no jump yet.
 
-        Args:
-            time_s: (m, n_patches) of the acquisitions.
-            patch: (n,) of the taxels.
+        Acquisitions are at (m, n_patches) times; ``patch`` is (n,), of the taxels.
         """
         if not any(time_s[-1].max() >= jump.at_s for jump in self.jumps):
             return None, None

@@ -12,9 +12,8 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.structure import Structure
+from skinware.tactile.arrays import Doubles, Whole
 
-ArrayF = npt.NDArray[np.float64]
-ArrayI = npt.NDArray[np.int64]
 Taxels = slice | npt.ArrayLike
 """Some of n taxels: an index of an array of them (numbers, a slice, a mask)."""
 
@@ -45,10 +44,10 @@ class Surface:
         ConfigurationError: the arrays do not fit each other, or a module is in two patches.
     """
 
-    position_m: ArrayF
-    normal: ArrayF
-    module: ArrayI
-    patch: ArrayI
+    position_m: Doubles
+    normal: Doubles
+    module: Whole
+    patch: Whole
 
     def __post_init__(self) -> None:
         n = len(self.position_m)
@@ -114,25 +113,16 @@ class Surface:
         return int(self.patch.max()) + 1 if len(self) else 0
 
     def geometry(self, frame: str = "world", type_name: str = "pressure") -> Geometry:
-        """Return the places of the n taxels, with the uids 0 to n - 1.
-
-        Args:
-            frame: name of the coordinate frame.
-            type_name: sensor type of the taxels.
-        """
+        """Return the places of the n taxels in a coordinate frame, with the uids 0 to n - 1."""
         n = len(self)
         places = Geometry.unknown([type_name] * n, np.arange(n, dtype=np.uint64))
         places.position_m[:], places.normal[:], places.frame[:] = self.position_m, self.normal, frame
         return places
 
-    def taxels(self, some: Taxels) -> ArrayI:
-        """Return the numbers of some taxels.
-
-        Raises:
-            ConfigurationError: there are no such taxels.
-        """
+    def taxels(self, some: Taxels) -> Whole:
+        """Return the numbers of some taxels; raises ConfigurationError if there are no such taxels."""
         try:
-            found: ArrayI = np.arange(len(self))[some if isinstance(some, slice) else np.asarray(some)]
+            found: Whole = np.arange(len(self))[some if isinstance(some, slice) else np.asarray(some)]
         except IndexError as error:
             raise ConfigurationError(f"of {len(self)} taxels: {error}") from None
         return np.atleast_1d(found)
@@ -165,12 +155,7 @@ def grid(
 
 
 def triangles(modules: int = 1, *, patches: int = 1) -> Surface:
-    """Make a flat strip of ROBOSKIN triangles of ten taxels along x, facing +z, every second one upside down.
-
-    Args:
-        modules: number of triangles.
-        patches: number of patches, with an equal share of the triangles each.
-    """
+    """Make a flat strip of ROBOSKIN triangles of ten taxels along x, facing +z, every second one upside down."""
     places = [
         TRIANGLE_M * (-1 if number % 2 else 1) + [number * SIDE_M / 2, number % 2 * SIDE_M / np.sqrt(12)]
         for number in range(modules)
@@ -178,7 +163,7 @@ def triangles(modules: int = 1, *, patches: int = 1) -> Surface:
     return _flat(np.concatenate(places), np.repeat(np.arange(modules), len(TRIANGLE_M)), modules, patches)
 
 
-def _flat(places: npt.NDArray[Any], module: ArrayI, modules: int, patches: int) -> Surface:
+def _flat(places: npt.NDArray[Any], module: Whole, modules: int, patches: int) -> Surface:
     position = np.zeros((len(places), 3))
     position[:, :2] = places
     normal = np.zeros_like(position)
@@ -186,7 +171,7 @@ def _flat(places: npt.NDArray[Any], module: ArrayI, modules: int, patches: int) 
     return Surface(position, normal, module, module * patches // modules)
 
 
-def _numbered(of: npt.NDArray[Any]) -> ArrayI:
+def _numbered(of: npt.NDArray[Any]) -> Whole:
     return np.unique(of, return_inverse=True)[1].astype(np.int64)
 
 
@@ -228,14 +213,14 @@ def arm(boards: Sequence[int] = (0, 1, 2, 3), *, pads: bool = False) -> Surface:
     )
 
 
-def arm_path(board: int) -> ArrayF:
+def arm_path(board: int) -> Doubles:
     """Return (16, 3) the middles of a board's triangles in the order of a closed walk over them, m."""
     middle = np.zeros((1, 2))
     tour = _TOURS[board % _PARTS == _HAND]
     return np.concatenate([_triangle(board, triangle, middle)[0] for triangle in tour])
 
 
-def _triangle(board: int, triangle: int, flat: npt.NDArray[np.float64]) -> tuple[ArrayF, ArrayF]:
+def _triangle(board: int, triangle: int, flat: Doubles) -> tuple[Doubles, Doubles]:
     """(k, 3) points of a triangle, given as (k, 2) in its plane; and its normal."""
     number, part = divmod(board, _PARTS)
     if part == _HAND:

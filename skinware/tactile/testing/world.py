@@ -11,12 +11,11 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware.status import Status
+from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole
 from skinware.tactile.rule import UNUSABLE
 from skinware.tactile.testing.gestures import Cover, Gesture, How, Push, Stroke
 from skinware.tactile.testing.response import Faults, Jump, Missing, Response
 from skinware.tactile.testing.surface import Surface, Taxels
-
-ArrayF = npt.NDArray[np.float64]
 
 _START_NS = 1_000_000_000
 _ROWS = 2048
@@ -35,19 +34,15 @@ class Block:
         truth: (m, n) float32, the load in counts, without drift, noise, sag, creep and faults. It does not clip.
     """
 
-    time_ns: npt.NDArray[np.int64]
-    module_time_ns: npt.NDArray[np.int64]
+    time_ns: Whole
+    module_time_ns: Whole
     values: npt.NDArray[np.generic]
-    status: npt.NDArray[np.uint8]
-    truth: npt.NDArray[np.float32]
+    status: Bytes
+    truth: Floats
 
     @classmethod
     def joined(cls, blocks: Sequence[Block]) -> Block:
-        """Join blocks, one after the other.
-
-        Raises:
-            ConfigurationError: there is no block.
-        """
+        """Join blocks, one after the other; raises ConfigurationError if there is none."""
         if not blocks:
             raise ConfigurationError("no frames: give a later end")
         names = [field.name for field in fields(cls)]
@@ -57,9 +52,9 @@ class Block:
         return len(self.time_ns)
 
     @property
-    def usable(self) -> npt.NDArray[np.bool_]:
+    def usable(self) -> Flags:
         """(m, n) bool: there is a value, and it is of this frame."""
-        usable: npt.NDArray[np.bool_] = (self.status & np.uint8(UNUSABLE)) == 0
+        usable: Flags = (self.status & np.uint8(UNUSABLE)) == 0
         return usable
 
     def __iter__(self) -> Iterator[Sample]:
@@ -80,11 +75,11 @@ class Sample:
     """One frame, a row of a :class:`Block`: its arrays are (n,) and (n_modules,)."""
 
     time_ns: int
-    module_time_ns: npt.NDArray[np.int64]
+    module_time_ns: Whole
     values: npt.NDArray[np.generic]
-    status: npt.NDArray[np.uint8]
-    usable: npt.NDArray[np.bool_]
-    truth: npt.NDArray[np.float32]
+    status: Bytes
+    usable: Flags
+    truth: Floats
 
 
 @dataclass
@@ -143,13 +138,11 @@ class World:
     dtype: npt.DTypeLike = np.uint8
     gestures: list[Gesture] = field(default_factory=list, init=False)
     faults: Faults = field(init=False)
-    gain: ArrayF = field(init=False)
-    follows: ArrayF = field(init=False)
-    wave_phase: ArrayF = field(init=False)
-    late_s: ArrayF = field(init=False)
-    _known_near: dict[tuple[Gesture, float], npt.NDArray[np.bool_]] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    gain: Doubles = field(init=False)
+    follows: Doubles = field(init=False)
+    wave_phase: Doubles = field(init=False)
+    late_s: Doubles = field(init=False)
+    _known_near: dict[tuple[Gesture, float], Flags] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not len(self.surface):
@@ -199,7 +192,7 @@ class World:
         self.gestures.append(cover)
         return cover
 
-    def pressing(self, time_s: float) -> list[tuple[Gesture, ArrayF, float]]:
+    def pressing(self, time_s: float) -> list[tuple[Gesture, Doubles, float]]:
         """Return the gestures that press at a time, each with its place (3,) and its force."""
         at = np.array([time_s])
         found = [(gesture, gesture.points_m(at)[0], float(gesture.forces(at)[0])) for gesture in self.gestures]
@@ -230,22 +223,11 @@ class World:
         source[one], source[other] = source[other].copy(), source[one].copy()
 
     def missing(
-        self,
-        taxels: Taxels,
-        begin_s: float,
-        end_s: float,
-        *,
-        status: Status = Status.STALE,
-        value: float | None = None,
+        self, taxels: Taxels, begin_s: float, end_s: float, *, status: Status = Status.STALE, value: float | None = None
     ) -> None:
         """Let taxels send nothing for a while. For nothing in the first frame, begin before 0.
 
-        Args:
-            taxels: which.
-            begin_s: from then on.
-            end_s: until then.
-            status: their status meanwhile; ``Status(0)``: none.
-            value: value in their place (NaN, if the dtype has it); None: the last one.
+        Meanwhile they have a status (``Status(0)``: none), and a value (NaN, if the dtype has it); None: the last one.
         """
         dtype = np.dtype(self.dtype)
         if value is not None and not (dtype.kind == "f" or np.iinfo(dtype).min <= value <= np.iinfo(dtype).max):
@@ -264,11 +246,7 @@ class World:
             yield from block
 
     def record(self, until_s: float) -> Block:
-        """Return every frame from second 0 on, in one block.
-
-        Raises:
-            ConfigurationError: there is none.
-        """
+        """Return every frame from second 0 on, in one block; raises ConfigurationError if there is none."""
         return Block.joined(list(self.blocks(until_s)))
 
     def blocks(self, until_s: float, rows: int = _ROWS) -> Iterator[Block]:
@@ -278,14 +256,10 @@ class World:
         for first in range(0, total, rows):
             yield state.next_block(first, min(rows, total - first))
 
-    def loads(self, time_s: ArrayF) -> tuple[ArrayF, ArrayF]:
-        """Return the load of all gestures together, in counts.
+    def loads(self, time_s: Doubles) -> tuple[Doubles, Doubles]:
+        """Return (m, n) the load of all gestures together, and (m, n) how much is missing as the cover sags, in counts.
 
-        Args:
-            time_s: (m, n_patches) when each patch acquires its data.
-
-        Returns:
-            (m, n) the load, and (m, n) what is missing because the cover sags.
+        ``time_s`` is (m, n_patches), when each patch acquires its data.
         """
         load = np.zeros((len(time_s), len(self.surface)))
         missing = np.zeros_like(load) if self.response.sag else load[:0]
@@ -303,17 +277,10 @@ class World:
                     missing[rows, taxels] += sagged
         return load, missing
 
-    def felt(self, time_s: ArrayF, taxels: Taxels) -> ArrayF:
-        """Return what taxels feel of all gestures at given times, in counts: the load less the sag.
+    def felt(self, time_s: Doubles, taxels: Taxels) -> Doubles:
+        """Return (m, k) what k taxels feel of all gestures at (m,) times, in counts: the load less the sag.
 
         It is for programs that make frames with times and noise of their own.
-
-        Args:
-            time_s: (m,).
-            taxels: k taxels.
-
-        Returns:
-            (m, k).
         """
         numbers = self.surface.taxels(taxels)
         total = np.zeros((len(time_s), len(numbers)))
@@ -325,7 +292,7 @@ class World:
         total *= self.faults.feels[numbers]
         return total
 
-    def _near(self, gesture: Gesture) -> npt.NDArray[np.bool_]:
+    def _near(self, gesture: Gesture) -> Flags:
         key = gesture, self.response.reach_m
         near = self._known_near.get(key)
         if near is None:
@@ -334,7 +301,7 @@ class World:
             near = self._known_near[key] = gesture.least_distances_m(self.surface) <= self.response.reach_m
         return near
 
-    def _felt(self, gesture: Gesture, time_s: ArrayF, taxels: npt.NDArray[np.int64]) -> tuple[ArrayF, ArrayF]:
+    def _felt(self, gesture: Gesture, time_s: Doubles, taxels: Whole) -> tuple[Doubles, Doubles]:
         force = self.sensitivity * gesture.forces(time_s)[:, np.newaxis] * self.gain[taxels]
         distance = gesture.distances_m(time_s, self.surface, taxels)
         load = force * self.response.bell(distance)
@@ -377,10 +344,10 @@ class _State:
         of_patch[surface.module] = surface.patch
         return Block(time_ns.max(axis=1), time_ns[:, of_patch], values, status, load.astype(np.float32))
 
-    def _signal(self, time_s: ArrayF, load: ArrayF) -> ArrayF:
+    def _signal(self, time_s: Doubles, load: Doubles) -> Doubles:
         world, faults = self._world, self._world.faults
         m, n = load.shape
-        signal: ArrayF = self._noise.standard_normal((m, n), np.float32) * (world.noise * faults.noise)
+        signal: Doubles = self._noise.standard_normal((m, n), np.float32) * (world.noise * faults.noise)
         felt = load * faults.feels
         signal += felt
         if world.response.creep or world.response.remainder:
@@ -401,7 +368,7 @@ class _State:
             signal += walked
         return signal
 
-    def _values(self, signal: ArrayF) -> npt.NDArray[np.generic]:
+    def _values(self, signal: Doubles) -> npt.NDArray[np.generic]:
         world, faults = self._world, self._world.faults
         signal += world.idle
         if world.step:
@@ -415,7 +382,7 @@ class _State:
             values = values[:, faults.source]
         return values
 
-    def _leave_out(self, time_s: ArrayF, values: npt.NDArray[np.generic], status: npt.NDArray[np.uint8]) -> None:
+    def _leave_out(self, time_s: Doubles, values: npt.NDArray[np.generic], status: Bytes) -> None:
         for gap in self._world.faults.missing:
             gone = (time_s >= gap.begin_s) & (time_s < gap.end_s)
             for patch in np.flatnonzero(gone.any(axis=0)).tolist():

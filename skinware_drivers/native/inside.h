@@ -12,7 +12,7 @@ struct words { /* what Python sees and sets between calls */
     int64_t n_held;   /* updates that are held back from one take to the next */
     int64_t newest_ns, due_ns, not_before_ns, last_published_ns;
     int64_t on_request, wanted_ns; /* publish only what is asked for; the oldest data that somebody waits for */
-    int64_t hastened;              /* a patch sends too fast to tell its cycles apart */
+    int64_t hastened;              /* frames came too soon: plan.haste has more */
     int64_t store;                 /* address of the updates */
     int64_t sequence;              /* of the newest frame */
     int64_t must_leave;            /* the event loop has something to do */

@@ -112,7 +112,7 @@ static int64_t match(struct path *path, const struct cycle *cycle, int64_t m, in
     int64_t n = cycle->n, n_starts = 0, n_candidates = 0, n_out = 0;
     int64_t *starts = path->starts, *late = path->found;
     for (int64_t i = 0; i + n <= m; i++) {
-        if (path->place[i] >= n || !is_cycle(path, cycle, i))
+        if (!is_cycle(path, cycle, i))
             continue;
         if (!can_be_trusted(path, cycle, i) || path->time_ns[i + n - 1] - path->time_ns[i] > cycle->maximum_age_ns)
             late[n_candidates++] = i;
@@ -206,7 +206,7 @@ void find_cycles(struct path *path, const struct cycle *cycle, int64_t number)
     fill_in(path, cycle, number, m);
     if (cycle->is_timed)
         judge(path, cycle, m);
-    int64_t n_starts = match(path, cycle, m, &n_late), n_soon = 0;
+    int64_t n_starts = match(path, cycle, m, &n_late);
     for (int64_t i = 0; i < m; i++) {
         int64_t row = path->order[i];
         path->next[row] = -1; /* from now on: the cycle that ends with this row */
@@ -217,7 +217,7 @@ void find_cycles(struct path *path, const struct cycle *cycle, int64_t number)
         }
         if (path->is_orphan[i]) {
             path->next[row] = m + i;
-            n_soon += path->is_soon[i];
+            path->words->hastened |= path->is_soon[i];
             plan->haste[plan->module_patch[path->entry[row]]] += path->is_soon[i];
         } else if (path->is_waiting[i])
             path->next[row] = 2 * m + i;
@@ -232,8 +232,6 @@ void find_cycles(struct path *path, const struct cycle *cycle, int64_t number)
         if (plan->haste[patch] > 0)
             plan->haste[patch] = 0;
     }
-    for (int64_t patch = 0; n_soon && patch < plan->n_patches; patch++)
-        path->words->hastened |= plan->haste[patch] > MUCH_HASTE;
     for (int64_t row = path->batch->start; row < path->batch->stop; row++) {
         int64_t what = path->next[row];
         if (what >= 2 * m)

@@ -15,7 +15,7 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, MOST_MEMBERS = 128, MUCH_HASTE = 200 };
+enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, MOST_MEMBERS = 128 };
 #define NEVER_NS (-(INT64_C(1) << 62)) /* punctuality: none came yet */
 
 /* -- what a layout compiles to ------------------------------------------------------------------------------------- */

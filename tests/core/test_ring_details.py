@@ -251,6 +251,12 @@ def test_a_wait_for_several_rings_ends_without_news() -> None:
             assert two.next(NEWER, timeout_ns) == []
 
 
+def test_a_wait_that_the_kernel_refuses_is_left_to_python() -> None:
+    with Two() as two:
+        two.take.state_in_c.count = 0  # of which it refuses to take care
+        assert two.next(NEWER, MS) is None
+
+
 def test_every_wake_of_any_ring_ends_a_wait_and_none_is_left_to_python() -> None:
     """Also one that comes before the sleep has begun. Another process wakes, which needs no interpreter lock."""
     with Two() as two:

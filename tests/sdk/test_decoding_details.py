@@ -7,14 +7,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from skinware import Status
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.bus import FrameBatch
+from skinware_drivers.bus import Filter, FrameBatch
 from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, taxels
-from skinware_drivers.fields import Bits, Flag, Identifier, SequenceNumber, StatusBytes
+from skinware_drivers.fields import Bits, DeviceTime, Flag, Identifier, SequenceNumber, StatusBytes
 from skinware_drivers.layout import Cycle, Frame, Layout, Values
 from tests.specification.both_paths import Pair, hand_clock
 from tests.specification.decoding import SpecifiedDecoder
@@ -109,6 +110,16 @@ def test_updates_are_shown_in_the_order_of_their_times_however_they_come() -> No
                 pair.feed(frames)
                 latest = max(frames, key=lambda frame: (frame[1], frame[3][:2][::-1]))
                 assert pair.native.decoder.state.values.tolist() == [int.from_bytes(latest[3][:2], "little")]
+
+
+def test_a_device_that_says_0_says_its_time() -> None:
+    layout = one_frame(Values(0, "u1", 1), module=0, time=DeviceTime(4, "<u2", 1e-3))
+    with decoding(layout, skin([Module(taxels(1))])) as (pair, begin_ns):
+        for stamp_ms, late_ms in ((65516, 0), (65526, 3), (0, 3), (10, 0), (20, 2)):
+            time_ns = begin_ns + (stamp_ms - 65516) % 65536 * MS
+            payload = bytes(4) + stamp_ms.to_bytes(2, "little") + bytes(2)
+            pair.feed([(0, time_ns + late_ms * MS, 0x100, payload)])
+            assert pair.native.decoder.state.patch_time_ns.tolist() == [time_ns]
 
 
 @pytest.mark.parametrize(("longer_ns", "is_prompt"), [(-1, True), (0, True), (1, False)])
@@ -259,3 +270,44 @@ def test_the_numbers_of_foreign_frames_are_counted_by_identifier() -> None:
         0: 1,
         0x7FF: 2,
     }
+
+
+def test_all_updates_of_a_batch_are_kept_however_many_they_are() -> None:
+    layout = one_frame(Values(0, "<u2", 1), module=Bits(0, 4))
+    modules = [Module(taxels(1, first_uid=key), key=key) for key in range(16)]
+    with decoding(layout, skin(modules, dtype="<u2")) as (pair, begin_ns):
+        for count in (1000, 17, 1000):
+            frames = [(0, begin_ns + at, 0x100 | at % 16, at.to_bytes(2, "little") + bytes(6)) for at in range(count)]
+            pair.feed(frames)
+            assert pair.native.decoder.state.values.tolist() == [
+                (count - 1 - key) // 16 * 16 + key for key in range(16)
+            ]
+            begin_ns += PERIOD_NS
+        assert counted(pair) == {"updates": 2017}
+
+
+def test_frames_of_no_module_are_offered_to_those_who_wait_for_such() -> None:
+    layout = one_frame(Values(0, "u1", 1), module=0)
+    with decoding(layout, skin([Module(taxels(1))])) as (pair, begin_ns):
+        path, offered, heard = pair.native._path, list[int](), list[int]()
+
+        def offer(rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+            offered.extend(pair.native.batch.wire["identifier"][rows].tolist())
+            return rows
+
+        path.listeners.offer = offer
+        path.listeners.hear = lambda rows: heard.append(len(rows))
+        for expects_data, awaited, expected in (
+            (False, [], []),
+            (False, [Filter(0x333, 0x7FF)], [0x333, 0x333]),
+            (True, [Filter(0x777, 0x7FF), Filter(0x330, 0x7F0)], [0x333, 0x334, 0x333]),
+            (True, [Filter(0x100, 0x7FF)], []),
+        ):
+            offered.clear()
+            path.announce_waits(expects_data, awaited)
+            identifiers = (0x333, 0x100, 0x334, 0x444, 0x333)
+            pair.feed([(0, begin_ns + at, identifier, bytes(8)) for at, identifier in enumerate(identifiers)])
+            assert offered == expected
+            begin_ns += PERIOD_NS
+        assert heard == [5, 5]
+        assert pair.native.decoder.state.bus_counters[0, BUS_COUNTERS.index("unknown")] == 16

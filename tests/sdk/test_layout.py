@@ -434,23 +434,35 @@ def test_half_a_cycle_that_cannot_be_expanded_shows_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    ("wrong", "words"),
     [
-        lambda payload, length: (np.arange(2), np.zeros(1, np.int64), np.zeros(1)),
-        lambda payload, length: (np.array([9]), np.array([0]), np.array([1])),
-        lambda payload, length: (np.array([0]), np.array([0]), np.array(["one"])),
-        lambda payload, length: None,
-        lambda payload, length: (np.array([0]), np.array([0]), np.array([256])),
-        lambda payload, length: (np.array([0]), np.array([0]), np.array([0.5])),
-        lambda payload, length: sys.exit(7),
+        (
+            lambda payload, length: (np.arange(2), np.zeros(1, np.int64), np.zeros(1)),
+            "ValueError: it returned 2 rows, 1 channels, 1 float64 values",
+        ),
+        (lambda payload, length: (np.array([9]), np.array([0]), np.array([1])), "IndexError: "),
+        (
+            lambda payload, length: (np.array([0]), np.array([0]), np.array(["one"])),
+            "ValueError: it returned 1 rows, 1 channels, 1 <U3 values",
+        ),
+        (lambda payload, length: None, "TypeError: "),
+        (
+            lambda payload, length: (np.array([0, 0]), np.array([0, 0]), np.array([255, 256])),
+            "ValueError: it returned 256: the driver's dtype uint8 cannot hold it",
+        ),
+        (
+            lambda payload, length: (np.array([0]), np.array([0]), np.array([0.5])),
+            "ValueError: it returned 0.5: the driver's dtype uint8 cannot hold it",
+        ),
+        (lambda payload, length: sys.exit(7), "SystemExit: 7"),
     ],
     ids=["unequal", "no such row", "no number", "nothing", "wider than the dtype", "a fraction", "the end"],
 )
-def test_what_an_expand_must_not_return_is_counted(wrong: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_an_expand_must_not_return_is_counted(wrong: Any, words: str, caplog: pytest.LogCaptureFixture) -> None:
     decoder = decode(one(Expand(wrong)), [Module(taxels(1))], "u1", [(0x100, bytes(8))])
     assert decoder.state.status.tolist() == [Status.NEVER_SEEN]
     assert decoder.state.bus_counters[0, :3].tolist() == [0, 0, 1]
-    assert "frame 'data': its Expand function raised" in caplog.text
+    assert f"frame 'data': its Expand function raised {words}" in caplog.text
 
 
 def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:

@@ -21,7 +21,7 @@ from tests.specification.both_paths import Pair, hand_clock
 from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000
-PERIOD_NS = 20 * MS
+PERIOD_NS = 20 * MS + 1  # odd: half of it is no whole number
 USUAL_NS = 26 * MS
 """Of a device that is slower than it should be."""
 MODULES = 2
@@ -69,7 +69,7 @@ class Device:
     @property
     def decoder(self) -> SpecifiedDecoder:
         layout, tables = self.skin
-        return SpecifiedDecoder([layout], tables, [0.02])
+        return SpecifiedDecoder([layout], tables, [PERIOD_NS / 1e9])
 
     def wire(self, frame: Sent) -> tuple[int, bytes]:
         """Identifier and payload."""
@@ -79,7 +79,7 @@ class Device:
     def join_in_c(self, sent: Sequence[Sent], cuts: Sequence[int] = ()) -> None:
         """Fail unless C does the same as numpy."""
         layout, tables = self.skin
-        with hand_clock() as clock, Pair(clock, [layout], tables, [0.02]) as pair:
+        with hand_clock() as clock, Pair(clock, [layout], tables, [PERIOD_NS / 1e9]) as pair:
             begin_ns = clock.now_ns
             for begin, end in zip([0, *cuts], [*cuts, len(sent)], strict=True):
                 frames = [(0, begin_ns + frame.time_ns, *self.wire(frame)) for frame in sent[begin:end]]
@@ -265,6 +265,31 @@ def test_a_frame_is_in_time_up_to_the_nanosecond(order: Order, modulo: int) -> N
         joined, counters = device.joined(sent)
         assert (joined, counters["orphans"]) == oracle(device, sent), sent
     device.join_in_c(*one_after_the_other(paced(device)))
+
+
+def held_up_after_a_loss(device: Device) -> Iterator[list[Sent]]:
+    """Cycles of one module: a frame is lost, and the cycle after it comes up to as late or early as can be trusted."""
+    beside_ns = (PERIOD_NS - device.maximum_age_ns) // 2
+    for lost, side, step_ns in product(range(2), (-1, 1), (-1, 0, 1)):
+        after_ns = 3 * PERIOD_NS + side * beside_ns + step_ns
+        begins_ns = [0, PERIOD_NS, 2 * PERIOD_NS, after_ns, after_ns + PERIOD_NS]
+        parts = [(cycle, place) for cycle in range(5) for place in range(2) if (cycle, place) != (2, lost)]
+        yield [
+            Sent(begins_ns[cycle] + (1 + place) * MS, 0, place, cycle, serial)
+            for serial, (cycle, place) in enumerate(parts)
+        ]
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_a_cycle_after_a_loss_is_trusted_up_to_the_nanosecond(share: float) -> None:
+    device = Device(2, "given", "module", 1, round(share * PERIOD_NS))
+    shown = set()
+    for sent in held_up_after_a_loss(device):
+        joined, counters = device.joined(sent)
+        assert (joined, counters["orphans"]) == oracle(device, sent), sent
+        shown.add(len(joined))
+    assert shown == {3, 4}
+    device.join_in_c(*one_after_the_other(held_up_after_a_loss(device)))
 
 
 def one_after_the_other(streams: Iterable[Sequence[Sent]]) -> tuple[list[Sent], list[int]]:

@@ -31,9 +31,9 @@ def pad(folder: Path, *modules: str) -> PhysicsScene:
 
 
 def pressed(scene: PhysicsScene, force_n: float = 3.0, x: float = 0.0, y: float = 0.0) -> PhysicsScene:
-    scene.move({"press": -1.0, "x": x, "y": y})
+    scene.actuators.move({"press": -1.0, "x": x, "y": y})
     scene.step_to(scene.time_s + 0.3)
-    scene.move({"press": force_n})
+    scene.actuators.move({"press": force_n})
     scene.step_to(scene.time_s + 0.5)
     return scene
 
@@ -90,7 +90,7 @@ def test_the_forces_on_taxels_are_those_of_the_solver(tmp_path: Path) -> None:
 
 def test_a_ball_that_slides_drags_the_taxels_with_it(tmp_path: Path) -> None:
     scene = pressed(pad(tmp_path), 3.0)
-    scene.move({"x": 0.006}, 0.3)
+    scene.actuators.move({"x": 0.006}, 0.3)
     scene.step_to(scene.time_s + 0.25)
     [touch] = scene.touching()
     [forces] = scene.newtons()

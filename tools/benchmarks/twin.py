@@ -89,16 +89,16 @@ def pad(seed: int) -> Twin:
     grid = msgspec.structs.replace(module, rows=SIDE, columns=SIDE, axes="z")
     binding = msgspec.structs.replace(bound.binding, module=(grid,), move=())
     twin = Twin(msgspec.structs.replace(bound, binding=binding), seed)
-    twin.scene.move({"press": -1.0})
+    twin.scene.actuators.move({"press": -1.0})
     twin.wait(8)
     return twin
 
 
 def press(twin: Twin, at_m: ArrayF, force_n: float, rest_s: float = 0.5) -> list[Frame]:
     """Let the pad rest, press it for a second, and return all frames."""
-    twin.scene.move({"press": -1.0, "x": at_m[0], "y": at_m[1]})
+    twin.scene.actuators.move({"press": -1.0, "x": at_m[0], "y": at_m[1]})
     frames = twin.wait(rest_s)
-    twin.scene.move({"press": force_n - WEIGHT_N}, 0.2)
+    twin.scene.actuators.move({"press": force_n - WEIGHT_N}, 0.2)
     return frames + twin.wait(1.0)
 
 
@@ -158,7 +158,7 @@ def slip_onset(seed: int, slips: int) -> str:
             false += bool((np.asarray(frame.contacts.kind) == ContactKind.SLIDING).any())
             held_s += PERIOD_NS / 1e9
         distance_m, speed_m_s = random.uniform(0.004, 0.008), random.uniform(0.01, 0.05)
-        twin.scene.move({"x": start[0] + distance_m}, distance_m / speed_m_s)
+        twin.scene.actuators.move({"x": start[0] + distance_m}, distance_m / speed_m_s)
         begun, found = None, None
         for frame in twin.frames(distance_m / speed_m_s + 0.3):
             begun = frame.time_s if begun is None and frame.slip_m_s > SLIPS_M_S else begun
@@ -182,14 +182,14 @@ def loosened_grip(seed: int, hold_s: float) -> str:
     twin = Twin(msgspec.structs.replace(bound, binding=binding), seed, device=0)
     scene = twin.scene
     twin.wait(8)
-    scene.move(scene.poses["down"], 1.0)
+    scene.actuators.move(scene.actuators.poses["down"], 1.0)
     twin.wait(1.2)
-    scene.move(scene.poses["grip"], 0.5)
+    scene.actuators.move(scene.actuators.poses["grip"], 0.5)
     twin.wait(hold_s)
-    scene.move({"close": 0.0135}, 1.0)
+    scene.actuators.move({"close": 0.0135}, 1.0)
     twin.wait(1.5)
     felt = [bool(len(frame.contacts)) for frame in twin.frames(hold_s) if frame.force_n > 0.2]
-    scene.move(scene.poses["open"], 0.5)
+    scene.actuators.move(scene.actuators.poses["open"], 0.5)
     after = twin.wait(3)[100:]
     left = sum(bool(len(frame.contacts)) for frame in after)
     share = np.mean(felt)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -11,13 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.virtual.physics.actuators import Actuators, names_of
 from skinware_drivers.virtual.physics.binding import Bound
 from skinware_drivers.virtual.physics.taxels import BoundTaxels, add_sensors, place, place_sensors
 
 ArrayF = npt.NDArray[np.float64]
 
-_LONGEST_CATCH_UP_S = 1.0
-"""Time of the scene that is made up for; more is left out."""
 _NEAREST = 4
 """Taxels that share the force of a contact which none of them reaches into."""
 _SAME_WAY = 0.5
@@ -52,16 +51,15 @@ class PhysicsScene:
         model: MuJoCo's model, with a tactile sensor for each geom under taxels.
         data: MuJoCo's state.
         modules: the taxels, in the order of the binding.
-        poses: targets of actuators, by name of the pose.
+        actuators: what moves in it.
+        joints: names of its joints.
         touched_s: time of the scene when the present touch of modules began; NaN: nothing touches them.
-        commanded_s: time of the scene at the newest command from outside; NaN: there was none.
 
     Raises:
         ConfigurationError: the scene cannot be used, or does not fit its binding.
     """
 
     def __init__(self, bound: Bound) -> None:
-        self._bound = bound
         try:
             spec = mujoco.MjSpec.from_file(str(bound.scene))
             bare = spec.compile()
@@ -76,18 +74,12 @@ class PhysicsScene:
         for number, module in enumerate(self.modules):
             for geom in module.geoms.tolist():
                 self._module_of.setdefault(geom, []).append(number)
-        self.actuators: list[str] = self._names(mujoco.mjtObj.mjOBJ_ACTUATOR, self.model.nu)
-        self.joints: list[str] = self._names(mujoco.mjtObj.mjOBJ_JOINT, self.model.njnt)
-        self.poses: Mapping[str, Mapping[str, float]] = bound.binding.pose
-        for name, pose in self.poses.items():
-            self._check(pose, f"{bound.file}: pose {name!r}")
-        self._ramps: dict[int, tuple[float, float, float, float]] = {}  # actuator -> begin, end, from, to
-        self._next_move = 0
-        self._round = 0
+        self.actuators = Actuators(bound, self.model, self.data)
+        self.joints: list[str] = names_of(self.model, mujoco.mjtObj.mjOBJ_JOINT, self.model.njnt)
         self._touching: list[Touching] | None = None
         self._is_covered = np.zeros(self.model.ngeom, bool)
         self._is_covered[list(self._module_of)] = True
-        self.touched_s = self.commanded_s = math.nan
+        self.touched_s = math.nan
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         mujoco.mj_forward(self.model, self.data)
@@ -102,12 +94,7 @@ class PhysicsScene:
         step_s = self.model.opt.timestep
         steps = int((time_s - self.data.time) / step_s + 1e-6)
         for _ in range(steps):
-            self._obey_moves()
-            for actuator, (begin_s, end_s, start, target) in list(self._ramps.items()):
-                share = 1.0 if self.data.time >= end_s else (self.data.time - begin_s) / (end_s - begin_s)
-                self.data.ctrl[actuator] = start + share * (target - start)
-                if share == 1.0:
-                    del self._ramps[actuator]
+            self.actuators.advance()
             mujoco.mj_step(self.model, self.data)
             self._touching = None
             if not self._is_covered[self.data.contact.geom].any():
@@ -115,24 +102,6 @@ class PhysicsScene:
             elif math.isnan(self.touched_s):
                 self.touched_s = float(self.data.time) - step_s
         return max(0, steps)
-
-    def move(self, targets: Mapping[str, float], seconds: float = 0.0) -> None:
-        """Move actuators to targets, evenly within a time.
-
-        Raises:
-            ConfigurationError: there is no such actuator, or a number is none.
-        """
-        self._check(targets, "move")
-        if not 0 <= seconds <= 3600:
-            raise ConfigurationError(f"move: {seconds} s: give 0 to 3600")
-        now_s = float(self.data.time)
-        for name, target in targets.items():
-            actuator = self.actuators.index(name)
-            self._ramps[actuator] = now_s, now_s + seconds, float(self.data.ctrl[actuator]), float(target)
-
-    def hold(self) -> None:
-        """Stop every movement: the actuators keep the targets that they have."""
-        self._ramps.clear()
 
     def raw(self, module: int) -> ArrayF:
         """Return (3, n) MuJoCo's own sensor data of a module: depth, m, and its products with two speeds of slip."""
@@ -190,31 +159,6 @@ class PhysicsScene:
             speeds.append(six[3:] + turning)
         slip = frame[1:] @ (speeds[1] - speeds[0])
         return Touching(module, point, outward, float(force[0]), rotation.T @ shear, float(np.linalg.norm(slip)))
-
-    def _obey_moves(self) -> None:
-        moves, repeat_s = self._bound.binding.move, self._bound.binding.repeat_s
-        while self._next_move < len(moves):
-            move = moves[self._next_move]
-            if self.data.time + _EPSILON < move.at_s + self._round * (repeat_s or 0.0):
-                return
-            self.move(self.poses[move.pose], move.seconds)
-            self._next_move += 1
-            if self._next_move == len(moves) and repeat_s is not None:
-                self._next_move = 0
-                self._round += 1
-
-    def _names(self, kind: Any, count: int) -> list[str]:
-        names = [mujoco.mj_id2name(self.model, kind, number) for number in range(count)]
-        return [str(number) if name is None else name for number, name in enumerate(names)]
-
-    def _check(self, targets: Mapping[str, Any], where: str) -> None:
-        for name, target in targets.items():
-            if name not in self.actuators:
-                raise ConfigurationError(
-                    f"{where}: there is no actuator {name!r}; there are {', '.join(self.actuators)}"
-                )
-            if isinstance(target, bool) or not isinstance(target, int | float) or not np.isfinite(target):
-                raise ConfigurationError(f"{where}: {name}={target!r} is no number")
 
 
 def distances(taxels: BoundTaxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:

@@ -27,7 +27,7 @@ class WorldServices:
     def __init__(self, scene: PhysicsScene) -> None:
         self._scene = scene
         self._due_ns = 0
-        n, joints, actuators = len(scene.modules), len(scene.joints), len(scene.actuators)
+        n, joints, actuators = len(scene.modules), len(scene.joints), len(scene.actuators.names)
 
         def floats(shape: tuple[int, ...], unit: str, description: str) -> Column:
             return Column(np.dtype("<f8"), shape, unit, description)
@@ -61,8 +61,8 @@ class WorldServices:
             },
             {
                 "joint_name": _texts(scene.joints),
-                "actuator_name": _texts(scene.actuators),
-                "pose_name": _texts(list(scene.poses)),
+                "actuator_name": _texts(scene.actuators.names),
+                "pose_name": _texts(list(scene.actuators.poses)),
             },
             rate_hz=RATE_HZ,
             description="joints of a simulated scene",
@@ -90,15 +90,15 @@ class WorldServices:
             ValueError: there is no such pose.
             ConfigurationError: there is no such actuator, or a number is none.
         """
-        if pose and pose not in self._scene.poses:
-            raise ValueError(f"there is no pose {pose!r}; there are {', '.join(self._scene.poses)}")
-        self._scene.commanded_s = self._scene.time_s
-        self._scene.move({**(self._scene.poses[pose] if pose else {}), **(targets or {})}, seconds)
+        if pose and pose not in self._scene.actuators.poses:
+            raise ValueError(f"there is no pose {pose!r}; there are {', '.join(self._scene.actuators.poses)}")
+        self._scene.actuators.commanded_s = self._scene.time_s
+        self._scene.actuators.move({**(self._scene.actuators.poses[pose] if pose else {}), **(targets or {})}, seconds)
 
     def hold(self) -> None:
         """Stop every movement: actuators keep the targets that they have now."""
-        self._scene.commanded_s = self._scene.time_s
-        self._scene.hold()
+        self._scene.actuators.commanded_s = self._scene.time_s
+        self._scene.actuators.hold()
 
     def close(self) -> None:
         """Take the services away. Idempotent."""
@@ -125,8 +125,8 @@ class WorldServices:
         for row, (position, velocity) in enumerate(self._joint_rows):
             columns["position"][row] = scene.data.qpos[position]
             columns["velocity"][row] = scene.data.qvel[velocity]
-        columns["target"][: len(scene.actuators)] = scene.data.ctrl
-        columns["commanded_s"][0] = scene.commanded_s
+        columns["target"][: len(scene.actuators.names)] = scene.data.ctrl
+        columns["commanded_s"][0] = scene.actuators.commanded_s
         self._joints.commit(time_ns)
 
 

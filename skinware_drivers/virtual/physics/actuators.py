@@ -1,0 +1,89 @@
+"""The actuators of a scene: moved by the binding's own moves, by commands of programs, or held."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+
+from skinware.errors import ConfigurationError
+from skinware_drivers.virtual.physics.binding import Bound
+
+_EPSILON_S = 1e-9
+
+
+def names_of(model: Any, kind: Any, count: int) -> list[str]:
+    """Return the names of MuJoCo's objects of a kind; the number of one that has no name."""
+    names = [mujoco.mj_id2name(model, kind, number) for number in range(count)]
+    return [str(number) if name is None else name for number, name in enumerate(names)]
+
+
+class Actuators:
+    """The targets of a scene's actuators.
+
+    Attributes:
+        names: of the actuators.
+        poses: targets of actuators, by name of the pose.
+        commanded_s: time of the scene at the newest command from outside; NaN: there was none.
+
+    Raises:
+        ConfigurationError: a pose does not fit the actuators.
+    """
+
+    def __init__(self, bound: Bound, model: Any, data: Any) -> None:
+        self.names: list[str] = names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
+        self.poses: Mapping[str, Mapping[str, float]] = bound.binding.pose
+        self.commanded_s = math.nan
+        self._data = data
+        self._moves, self._repeat_s = bound.binding.move, bound.binding.repeat_s
+        self._next_move = self._round = 0
+        self._ramps: dict[int, tuple[float, float, float, float]] = {}  # actuator -> begin, end, from, to
+        for name, pose in self.poses.items():
+            self._check(pose, f"{bound.file}: pose {name!r}")
+
+    def move(self, targets: Mapping[str, float], seconds: float = 0.0) -> None:
+        """Move actuators to targets, evenly within a time.
+
+        Raises:
+            ConfigurationError: there is no such actuator, or a number is none.
+        """
+        self._check(targets, "move")
+        if not 0 <= seconds <= 3600:
+            raise ConfigurationError(f"move: {seconds} s: give 0 to 3600")
+        now_s = float(self._data.time)
+        for name, target in targets.items():
+            actuator = self.names.index(name)
+            self._ramps[actuator] = now_s, now_s + seconds, float(self._data.ctrl[actuator]), float(target)
+
+    def hold(self) -> None:
+        """Stop every movement: the actuators keep the targets that they have."""
+        self._ramps.clear()
+
+    def advance(self) -> None:
+        """Set the targets for the next step of the physics."""
+        self._begin_moves()
+        for actuator, (begin_s, end_s, start, target) in list(self._ramps.items()):
+            share = 1.0 if self._data.time >= end_s else (self._data.time - begin_s) / (end_s - begin_s)
+            self._data.ctrl[actuator] = start + share * (target - start)
+            if share == 1.0:
+                del self._ramps[actuator]
+
+    def _begin_moves(self) -> None:
+        while self._next_move < len(self._moves):
+            move = self._moves[self._next_move]
+            if self._data.time + _EPSILON_S < move.at_s + self._round * (self._repeat_s or 0.0):
+                return
+            self.move(self.poses[move.pose], move.seconds)
+            self._next_move += 1
+            if self._next_move == len(self._moves) and self._repeat_s is not None:
+                self._next_move = 0
+                self._round += 1
+
+    def _check(self, targets: Mapping[str, Any], where: str) -> None:
+        for name, target in targets.items():
+            if name not in self.names:
+                raise ConfigurationError(f"{where}: there is no actuator {name!r}; there are {', '.join(self.names)}")
+            if isinstance(target, bool) or not isinstance(target, int | float) or not math.isfinite(target):
+                raise ConfigurationError(f"{where}: {name}={target!r} is no number")

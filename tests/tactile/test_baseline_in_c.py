@@ -131,6 +131,18 @@ def test_a_restored_one_goes_on_alike() -> None:
     both.compare_states()
 
 
+def test_what_is_left_of_a_load_is_forgotten_when_it_rises_again() -> None:
+    """What then fades is a load that eases, not the rest of a cover that was pressed before."""
+    both, random = Both(np.zeros(12), np.zeros(12)), np.random.default_rng(3)
+    touched = []
+    for number in range(1, 1600):
+        time_s = number / 20
+        load = np.interp(time_s, [10, 10.2, 40, 40.1, 46, 46.1, 52, 72], [0, 200, 200, 20, 20, 60, 60, 10])
+        values = np.round(20 + 0.8 * random.standard_normal(12) + np.where(np.arange(12) < 2, load, 0))
+        touched.append(both.update(number * 50_000_000, values).touched[:2])
+    assert np.all(touched[20 * 12 :])
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_taxels_of_few_levels(levels: int) -> None:
     both, random = Both(np.arange(N) // 12, np.arange(N) // 48), np.random.default_rng(levels)

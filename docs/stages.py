@@ -14,18 +14,25 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
 import skinware
 import skinware.recording
-from skinware import DriverWriter, Namespace, ServiceWriter, Structure
+from skinware import DriverWriter, Namespace, ServiceWriter, SkinLayout, Structure
 from skinware.geometry import Geometry
+from skinware.memory import namespace
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
 from skinware.recording.replaying import Replayer
 from skinware.sensor_types import PRESSURE
+from skinware.tactile.contacts import Contacts
+from skinware.tactile.contacts_service import ContactsWriter
+from skinware.tactile.motion_service import MotionWriter
+from skinware.tactile.regions import Region, Regions
 from skinware.tactile.testing import Surface
+from skinware.tactile.tracking import TrackingSettings
 from skinware_drivers import Layout
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.testing.vectors import DirectPath
@@ -166,3 +173,114 @@ def replay(file: str) -> Callable[[], None]:
         shutil.rmtree(Namespace().path)
 
     return end
+
+
+def own_namespaces() -> None:
+    """Let the names of this process' namespaces be its own; their files go with it."""
+    namespace.ROOT = Path(tempfile.mkdtemp(dir="/dev/shm"))
+    atexit.register(shutil.rmtree, namespace.ROOT)
+
+
+def flat_arm() -> tuple[Structure, Geometry]:
+    """Return the structure and the places of a flat arm of 8 x 8 taxels."""
+    structure = Structure(
+        types=[PRESSURE.measured()],
+        buses=["x"],
+        patch_name=["p"],
+        patch_bus=[0],
+        module_patch=[0],
+        module_kind=["m"],
+        sensor_uid=range(64),
+        sensor_type=[PRESSURE.id] * 64,
+        sensor_module=[0] * 64,
+        dtype="<f4",
+    )
+    arm = Geometry.unknown(["pressure"] * 64, np.arange(64, dtype=np.uint64))
+    arm.position_m[:] = np.column_stack([np.arange(64) % 8, np.arange(64) // 8, np.zeros(64)]) * 0.005
+    arm.normal[:], arm.frame[:] = (0, 0, 1), "arm"
+    return structure.placed(arm), arm
+
+
+def press_an_arm() -> Structure:
+    """Publish the contacts of a flat arm on which four taxels are pressed; return its structure."""
+    structure, _ = flat_arm()
+    writer = ContactsWriter(structure, namespace="calm", rate_hz=50)
+    value = np.zeros(64)
+    value[[9, 10, 17, 18]] = 1000, 1000, 2000, 2000
+    _repeat(lambda _: writer.publish(value, value > 0, time.monotonic_ns()), writer)
+    return structure
+
+
+def stroke_an_arm() -> tuple[Structure, Regions, Contacts]:
+    """Publish the motion of a finger that strokes a flat arm; return its structure, its region and its contacts."""
+    structure, arm = flat_arm()
+    contacts = Contacts.of(structure, "pressure", tracking=TrackingSettings(frames=1))
+    regions = Regions([Region("palm", patch=("p",))])
+    writer = MotionWriter(structure, "pressure", regions, contacts.frames, namespace="calm", rate_hz=50)
+
+    def publish(frame: int) -> None:
+        away_m = np.hypot(arm.position_m[:, 0] - 0.001 * (frame % 35), arm.position_m[:, 1] - 0.02)
+        value = 10 * np.exp(-((away_m / 0.006) ** 2))
+        now_ns = time.monotonic_ns()
+        writer.publish(contacts.update(value, value > 0.1, now_ns), value, now_ns)
+
+    _repeat(publish, writer)
+    return structure, regions, Contacts.of(structure, "pressure", tracking=TrackingSettings(frames=1))
+
+
+def _repeat(publish: Callable[[int], object], writer: ContactsWriter | MotionWriter) -> None:
+    """Publish at 50 Hz until this process ends; the number of the frame goes up from 1."""
+    stopping = threading.Event()
+
+    def run() -> None:
+        frame = 0
+        while not stopping.wait(0.02):
+            frame += 1
+            publish(frame)
+
+    thread = threading.Thread(target=run, daemon=True)  # others are waited for before what is registered runs
+    thread.start()
+    atexit.register(writer.close)
+    atexit.register(thread.join)
+    atexit.register(stopping.set)
+
+
+def make_grasp_trials() -> None:
+    """Go to a new folder and write files like those of the iCub Grasp Dataset into its folder ``trials``."""
+    os.chdir(tempfile.mkdtemp())
+    Path("trials").mkdir()
+    noise = np.random.default_rng(1)
+    for name, count in [("none_1", 12), ("none_2", 12), ("full_vitamin_water_3", 18)]:
+        text = " -10000\n"
+        for step in range(count):
+            rows = 243 + noise.integers(-1, 2, (5, 12)).astype(float)
+            rows[1, 3:6] -= (20 + 4 * step) * name.startswith("full")
+            text += "1.0 " * 9 + "\n" + "14.0 " * 5 + "\n" + "".join(" ".join(map(str, row)) + "\n" for row in rows)
+        Path(f"trials/{name}.txt").write_text(text)
+
+
+def skin_convert(*arguments: str) -> str:
+    """Run the command; return what it prints."""
+    command = Path(sys.executable).with_name("skin-convert")
+    return subprocess.run([command, *arguments], check=True, capture_output=True, text=True).stdout
+
+
+def hand_with_regions(page: str) -> SimpleNamespace:
+    """Go to a new folder with the regions file of a page; return a hand's snapshot, as far as the page reads it."""
+    (text,) = re.findall(r"^```toml\n(.*?)^```", Path(page).read_text(), re.MULTILINE | re.DOTALL)[:1]
+    os.chdir(tempfile.mkdtemp())
+    Path("regions.toml").write_text(text)
+    hand = Structure(
+        types=[PRESSURE.measured(unit="counts")],
+        buses=["x"],
+        patch_name=["board 14", "board 15"],
+        patch_bus=[0, 0],
+        module_patch=[0, 1],
+        module_kind=["palm", "fingertip"],
+        module_name=["", "fingertip 4"],
+        sensor_uid=[0x0E0000 + n for n in range(12)] + [0x0F0500 + n for n in range(12)],
+        sensor_type=[PRESSURE.id] * 24,
+        sensor_module=[0] * 12 + [1] * 12,
+        dtype="u1",
+    )
+    return SimpleNamespace(layout=SkinLayout(("left_hand",), (hand,)), physical=lambda _type_name: np.arange(24.0))

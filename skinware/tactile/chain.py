@@ -129,6 +129,7 @@ class ChainSettings:
 
     @classmethod
     def calm(cls) -> Self:
+        """Return the settings of a baseline and nothing else."""
         return cls([BaselineStageSettings()])
 
     @classmethod

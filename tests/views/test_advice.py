@@ -19,7 +19,7 @@ SAYS = "import json, sys; print(json.dumps({'findings': [{'what': 'silent', 'ask
 def run(ask: Coroutine[None, None, None]) -> None:
     """Run a test, and wait for the threads in which asyncio waited for processes."""
     asyncio.run(ask)
-    wait_until(lambda: not any(thread.name.startswith("asyncio-waitpid") for thread in threading.enumerate()))
+    wait_until(lambda: not any("waitpid" in thread.name for thread in threading.enumerate()))
 
 
 async def until_done(doctor: DoctorProgram) -> None:

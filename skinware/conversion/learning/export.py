@@ -24,7 +24,7 @@ from skinware.conversion.learning.features import (
     SkinFeatures,
     joined_rows,
 )
-from skinware.conversion.learning.forms import Form
+from skinware.conversion.learning.forms import SetForm
 from skinware.conversion.learning.timing import Episode, Planner, TimedTable
 from skinware.conversion.learning.wanted import Interval, Joined, LearningSet, intervals_of_marks
 from skinware.conversion.tables import RecordedSource, Selection, Table, TableSource, pyarrow, sensor_table
@@ -190,9 +190,9 @@ class _Set:
                 if name in self._features:
                     raise ConfigurationError(f"two features are both {name!r}")
                 self._features[name] = feature
-        self._form: Form | None = None
+        self._form: SetForm | None = None
         if wanted.form != "tactile":
-            self._form = Form(wanted, {name: timed.structure for name, timed in self._tables.items()})
+            self._form = SetForm(wanted, {name: timed.structure for name, timed in self._tables.items()})
             self._features = self._form.described(self._features)
 
     def write(self, folder: Path) -> None:

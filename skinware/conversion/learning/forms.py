@@ -22,7 +22,7 @@ STATE, AGE = "observation.state", "touch.age_s"
 _TACTILE = "observation.tactile."
 
 
-class Form:
+class SetForm:
     """Touch in one of these forms, made of the features of each driver.
 
     A value whose status is not good is 0. With several sensor types, names have that of the type.

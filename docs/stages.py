@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +23,7 @@ import skinware.recording
 from skinware import DriverWriter, Namespace, ServiceWriter, SkinLayout, Structure
 from skinware.geometry import Geometry
 from skinware.memory import namespace
+from skinware.realtime import Periodic
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
 from skinware.recording.replaying import Replayer
@@ -243,6 +244,46 @@ def _repeat(publish: Callable[[int], object], writer: ContactsWriter | MotionWri
     atexit.register(writer.close)
     atexit.register(thread.join)
     atexit.register(stopping.set)
+
+
+def touch_a_hand(stopped: Sequence[int]) -> Callable[[], None]:
+    """Publish the driver ``hand`` at 200 Hz, whose index tip is touched twice a second, until there is a stop.
+
+    Return a function that waits for its end.
+    """
+    structure = Structure(
+        types=[PRESSURE.measured(unit="counts")],
+        buses=["x"],
+        patch_name=["hand"],
+        patch_bus=[0],
+        module_patch=[0, 0],
+        module_kind=["3x3", "3x3"],
+        module_name=["thumb tip", "index tip"],
+        sensor_uid=range(18),
+        sensor_type=[PRESSURE.id] * 18,
+        sensor_module=[0] * 9 + [1] * 9,
+        dtype="<f4",
+    )
+    writer = DriverWriter("hand", structure, rate_hz=200)
+
+    def run() -> None:
+        for number, _ in enumerate(Periodic(200)):
+            if stopped or number > 6000:
+                break
+            columns = writer.begin()
+            columns["values"][:], columns["status"][:] = 10.0, 0
+            columns["values"][12] = 60.0 if number % 100 > 90 else 10.0
+            columns["module_time_ns"][:] = time.monotonic_ns()
+            writer.commit(time.monotonic_ns())
+
+    thread = threading.Thread(target=run)
+    thread.start()
+
+    def end() -> None:
+        thread.join()
+        writer.close()
+
+    return end
 
 
 def make_grasp_trials() -> None:

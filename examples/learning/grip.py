@@ -216,7 +216,7 @@ def plot(folder: Path) -> None:
         axes.plot(steps, shares.mean(axis=0), marker="o", label=name)
         axes.fill_between(steps, shares.min(axis=0), shares.max(axis=0), alpha=0.2)
     axes.set(xlabel="steps of training", ylabel=f"held with {WANTED_N:g} ± {TOLERANCE_N:g} N, %", ylim=(-2, 102))
-    axes.legend()
+    axes.legend(loc="center right")
     figure.tight_layout()
     figure.savefig(folder / "curves.png", dpi=150)
 

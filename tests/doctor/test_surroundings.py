@@ -184,6 +184,7 @@ def test_a_driver_that_has_found_no_board_is_told() -> None:
     with running("skin-driver", "--bus", bus) as driver:
         pid = driver.process.pid
         wait_until(lambda: pid in looking.waiting_drivers(set()))
+        wait_until(lambda: "no patch answers" in driver.errors)  # Python can lose an interrupt while it imports
         finding = found_until(of("timing", "no driver has published"), seconds=0.0)
     assert f"{pid}" in finding.evidence
     assert "has found no device so far" in finding.evidence

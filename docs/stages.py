@@ -27,7 +27,7 @@ from skinware.realtime import Periodic
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
 from skinware.recording.replaying import Replayer
-from skinware.sensor_types import PRESSURE
+from skinware.sensor_types import PRESSURE, SensorType
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.contacts_service import ContactsWriter
 from skinware.tactile.motion_service import MotionWriter
@@ -125,22 +125,16 @@ def decode_a_triangle(layout: Layout) -> None:
     assert state.status.tolist() == [4] + [0] * 11
 
 
+def _assembled(patches: Sequence[Patch], of_type: SensorType, dtype: str, bus: str = "x") -> Structure:
+    return assemble([(bus, patches)], [of_type], dtype).structure
+
+
 def record() -> None:
     """Write ``walk.mcap`` in a new folder, and go there: 2.5 s of a driver ``torso`` and of a service ``contacts``."""
     os.environ["SKINWARE_NAMESPACE"] = f"docs-{os.getpid()}"
     os.chdir(tempfile.mkdtemp())
-    structure = Structure(
-        types=[PRESSURE.measured(unit="counts")],
-        buses=["can0"],
-        patch_name=["board 7"],
-        patch_bus=[0],
-        module_patch=[0],
-        module_kind=["triangle"],
-        sensor_uid=np.arange(12),
-        sensor_type=[PRESSURE.id] * 12,
-        sensor_module=[0] * 12,
-        dtype="u2",
-    )
+    board = Patch("board 7", [Module(taxels(12), kind="triangle")])
+    structure = _assembled([board], PRESSURE.measured(unit="counts"), "u2", bus="can0")
     recorder = Recorder(Files(Path("walk.mcap")))
     thread = threading.Thread(target=recorder.run)
     thread.start()
@@ -184,18 +178,7 @@ def own_namespaces() -> None:
 
 def flat_arm() -> tuple[Structure, Geometry]:
     """Return the structure and the places of a flat arm of 8 x 8 taxels."""
-    structure = Structure(
-        types=[PRESSURE.measured()],
-        buses=["x"],
-        patch_name=["p"],
-        patch_bus=[0],
-        module_patch=[0],
-        module_kind=["m"],
-        sensor_uid=range(64),
-        sensor_type=[PRESSURE.id] * 64,
-        sensor_module=[0] * 64,
-        dtype="<f4",
-    )
+    structure = _assembled([Patch("p", [Module(taxels(64), kind="m")])], PRESSURE.measured(), "<f4")
     arm = Geometry.unknown(["pressure"] * 64, np.arange(64, dtype=np.uint64))
     arm.position_m[:] = np.column_stack([np.arange(64) % 8, np.arange(64) // 8, np.zeros(64)]) * 0.005
     arm.normal[:], arm.frame[:] = (0, 0, 1), "arm"
@@ -251,19 +234,11 @@ def touch_a_hand(stopped: Sequence[int]) -> Callable[[], None]:
 
     Return a function that waits for its end.
     """
-    structure = Structure(
-        types=[PRESSURE.measured(unit="counts")],
-        buses=["x"],
-        patch_name=["hand"],
-        patch_bus=[0],
-        module_patch=[0, 0],
-        module_kind=["3x3", "3x3"],
-        module_name=["thumb tip", "index tip"],
-        sensor_uid=range(18),
-        sensor_type=[PRESSURE.id] * 18,
-        sensor_module=[0] * 9 + [1] * 9,
-        dtype="<f4",
-    )
+    tips = [
+        Module(taxels(9, first_uid=9 * key), key=key, kind="3x3", name=f"{name} tip")
+        for key, name in enumerate(("thumb", "index"))
+    ]
+    structure = _assembled([Patch("hand", tips)], PRESSURE.measured(unit="counts"), "<f4")
     writer = DriverWriter("hand", structure, rate_hz=200)
 
     def run() -> None:

@@ -20,7 +20,7 @@ from skinware_drivers.bus import check_identifier
 from skinware_drivers.options import HasOptions
 from skinware_drivers.virtual.device import DATA, Device, EmulatorOptions
 from skinware_drivers.virtual.events import Event, FrameDamage
-from skinware_drivers.virtual.hardware import EventLog, WireFrame, name_of
+from skinware_drivers.virtual.hardware import EventLog, WireFrame
 from skinware_drivers.virtual.physics import WORLD_NS, open_world
 from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Wire
 
@@ -80,7 +80,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.counts: dict[str, int] = dict.fromkeys(counted, 0)
         self.silent: set[str] = set()
         self.devices: dict[int, Device] = {}
-        self.world: PhysicsWorld | None = open_world(options, name_of(type(self)))
+        self.world: PhysicsWorld | None = open_world(options, type(self))
         self._foreign: ForeignTraffic | None = None
         self._scheduled: list[tuple[int, Callable[[int], object]]] = []
         self._now_ns: int | None = None

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.device import EmulatorOptions
+from skinware_drivers.virtual.hardware import name_of
 
 if TYPE_CHECKING:
     from skinware_drivers.virtual.physics.world import PhysicsWorld
@@ -14,8 +15,8 @@ WORLD_NS = 2_000_000
 """Time between two looks at the commands of a world."""
 
 
-def open_world(options: EmulatorOptions, driver: str) -> PhysicsWorld | None:
-    """Open the world of an emulator's options; None: they have none.
+def open_world(options: EmulatorOptions, emulator: type) -> PhysicsWorld | None:
+    """Open the world of the options of an emulator; None: they have none.
 
     Raises:
         ConfigurationError: it cannot be used, or MuJoCo is not installed.
@@ -30,7 +31,7 @@ def open_world(options: EmulatorOptions, driver: str) -> PhysicsWorld | None:
             raise
         raise ConfigurationError("option world: MuJoCo is not installed: pip install 'skinware[mujoco]'") from None
     return PhysicsWorld(
-        find_binding(options.world, driver),
+        find_binding(options.world, name_of(emulator)),
         seed=options.seed,
         speed=options.world_speed,
         has_services=options.world_services,

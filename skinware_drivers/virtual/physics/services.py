@@ -68,7 +68,8 @@ class WorldServices:
             description="joints of a simulated scene",
             operations={"move": self.move, "hold": self.hold},
         )
-        self._joint_rows = [(int(model_q), int(model_v)) for model_q, model_v in _addresses(scene)]
+        addresses = zip(scene.model.jnt_qposadr, scene.model.jnt_dofadr, strict=True)
+        self._joint_rows = [(int(position), int(velocity)) for position, velocity in addresses]
 
     def serve(self, time_ns: int) -> None:
         """Carry out commands, and publish what is due.
@@ -132,7 +133,3 @@ class WorldServices:
 
 def _texts(names: list[str]) -> Any:
     return np.array([name.encode()[:_LONGEST_NAME] for name in names] or [b""], f"|S{_LONGEST_NAME}")
-
-
-def _addresses(scene: PhysicsScene) -> Any:
-    return zip(scene.model.jnt_qposadr, scene.model.jnt_dofadr, strict=True)

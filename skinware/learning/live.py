@@ -59,7 +59,7 @@ class ChosenSensors:
         index, chosen = known.of(layout, self.type_name), np.zeros(count, bool)
         for name in self.modules:
             chosen[index[name]] = True
-            if not len(np.arange(count)[index[name]]):
+            if not chosen[index[name]].any():
                 there_are = sorted({layout.modules[module] for module in layout.module_of(self.type_name).tolist()})
                 raise ConfigurationError(f"no {self.type_name} sensors in {name!r}; modules: {'; '.join(there_are)}")
         return np.flatnonzero(chosen)
@@ -343,18 +343,18 @@ class Totals:
 
 
 def points(layout: SkinLayout, values: npt.NDArray[Any], type_name: str, positions: Positions) -> npt.NDArray[Any]:
-    """Return (n, 6) float32 ``[x, y, z, Fx, Fy, Fz]``: places in m in their frames, and force against the skin.
+    """Return (..., n, 6) float32 ``[x, y, z, Fx, Fy, Fz]``: places in m in their frames, and force against the skin.
 
     The force is the value, in the unit of the type, against the outward normal; 0 where the normal is not known, as is
     the place.
 
     Args:
-        values: (n,) of the sensors at ``positions``.
+        values: (..., n) of the sensors at ``positions``.
     """
     geometry = layout.geometry(type_name)
     place = np.nan_to_num(geometry.position_m[positions])
-    force = -values[:, np.newaxis] * np.nan_to_num(geometry.normal[positions])
-    found: npt.NDArray[np.float32] = np.concatenate((place, force), axis=1).astype(np.float32)
+    force = -values[..., np.newaxis] * np.nan_to_num(geometry.normal[positions])
+    found: npt.NDArray[np.float32] = np.concatenate((np.broadcast_to(place, force.shape), force), axis=-1).astype("f4")
     return found
 
 

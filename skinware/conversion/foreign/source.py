@@ -54,7 +54,8 @@ def whole(source: ColumnSource, table: str, names: Sequence[str], most: int | No
         count += max(each.size for each in rows.values())
         if most is not None and count >= most:
             break
-    return {name: np.concatenate(found) if found else np.zeros(0) for name, found in parts.items()}
+    shapes = source.tables[table]
+    return {name: np.concatenate(found or [np.zeros((0, *shapes.get(name, ())))]) for name, found in parts.items()}
 
 
 def first_rows(source: ColumnSource, table: str) -> Rows:

@@ -41,7 +41,8 @@ class SetForm:
         self._wanted, self._drivers = wanted, tuple(structures)
         self._layout = SkinLayout(self._drivers, tuple(structures.values()))
         self._types = tuple(name for name in self._layout.types if len(self._all(name)))
-        self._totals = {name: Totals(self._layout, name, self._all(name), wanted.numbers) for name in self._types}
+        of_state = self._types if wanted.form == "state" else ()
+        self._totals = {name: Totals(self._layout, name, self._all(name), wanted.numbers) for name in of_state}
         self._images = {name: self._image(name) for name in self._types} if wanted.form == "images" else {}
 
     def described(self, features: Mapping[str, Feature]) -> dict[str, Feature]:
@@ -74,9 +75,7 @@ class SetForm:
             }
         if self._wanted.form == "points":
             return others | {
-                self._named(f"{_TACTILE}points", name): np.stack(
-                    [points(self._layout, row, name, self._all(name)) for row in of]
-                )
+                self._named(f"{_TACTILE}points", name): points(self._layout, of, name, self._all(name))
                 for name, of in values.items()
             }
         parts: list[npt.NDArray[Any]] = [others[STATE]] if STATE in others else []

@@ -1,4 +1,4 @@
-"""A model as a service: it sees the newest window, and its failures cost nobody else anything."""
+"""A model as a service gets the newest window, and its failures stop nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What becomes of frames that are out of order, cut off, unknown or at a limit: numpy and C, and what is promised."""
+"""Frames that are out of order, cut off, unknown or at a limit: numpy and C treat them as promised."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from tests.specification.decoding import SpecifiedDecoder
 MS = 1_000_000
 PERIOD_NS = 20 * MS + 1  # odd: half of it is no whole number
 USUAL_NS = 26 * MS
-"""Of a device that is slower than it should be."""
+"""The device is slower than it should be."""
 MODULES = 2
 Order = Literal["given", "any", "ends_with"]
 

@@ -1,4 +1,4 @@
-"""Topics of ROS 2 over zenoh as a skin: from our own node, from zenoh-ros2-sdk, and from nobody who can be read."""
+"""Topics of ROS 2 over zenoh as a skin: our own node, zenoh-ros2-sdk, and publishers that cannot be read."""
 
 from __future__ import annotations
 

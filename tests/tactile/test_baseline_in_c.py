@@ -132,7 +132,7 @@ def test_a_restored_one_goes_on_alike() -> None:
 
 
 def test_what_is_left_of_a_load_is_forgotten_when_it_rises_again() -> None:
-    """What then fades is a load that eases, not the rest of a cover that was pressed before."""
+    """A load that eases then is no rest of a cover that was pressed before."""
     both, random = Both(np.zeros(12), np.zeros(12)), np.random.default_rng(3)
     touched = []
     for number in range(1, 1600):

@@ -34,11 +34,11 @@ SIDE = 8
 HELD = 50
 """Frames at the end of a press, when it no longer changes."""
 WEIGHT_N = 0.05 * 9.81
-"""Of the ball."""
+"""The weight of the ball, N."""
 
 
 class Frame(NamedTuple):
-    """What skinware says, and what is true."""
+    """Figures of skinware, and the true ones."""
 
     time_s: float
     load: ArrayF

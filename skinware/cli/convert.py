@@ -86,10 +86,10 @@ _learning_options = cli.options(
     ),
     click.option(
         "--numbers",
-        type=click.Choice(["module", "taxel"]),
+        type=click.Choice(["module", "taxel", "point"]),
         default="module",
         show_default=True,
-        help="lerobot, as state: sum and largest value of each module, or each taxel.",
+        help="lerobot, as state: sum and largest value of each module; each taxel; or place and force of each.",
     ),
     click.option(
         "--size", type=_size, default="64x64", show_default=True, metavar="WIDTHxHEIGHT", help="lerobot, as images."

@@ -17,8 +17,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import skinware
 import skinware.recording
+from skinware.learning.features import Totals
 from skinware.learning.images import Colours, TouchImage, range_of
-from skinware.learning.live import Totals
 
 BIN = Path(sys.executable).parent
 Numbers = npt.NDArray[np.int64]

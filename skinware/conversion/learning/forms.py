@@ -13,8 +13,8 @@ from skinware.conversion.learning.features import IMAGE, Batch, Feature
 from skinware.conversion.learning.wanted import LearningSet
 from skinware.conversion.tables import package
 from skinware.errors import ConfigurationError
+from skinware.learning.features import Totals, points
 from skinware.learning.images import Colours, TouchImage, range_of
-from skinware.learning.live import Totals, points
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 

@@ -17,6 +17,7 @@ from skinware.conversion.foreign import open_source
 from skinware.conversion.foreign.source import Rows, whole
 from skinware.conversion.tables import TableSource
 from skinware.errors import ConfigurationError
+from skinware.learning.features import Each
 from skinware.realtime import NS_PER_S
 from skinware.text import nearest_name
 
@@ -77,7 +78,7 @@ class LearningSet:
         form: ``tactile``: values, status and age of each driver; or in a form that stock policies of LeRobot read:
             ``state``: numbers in ``observation.state``, as the robot ``skinware`` has them; ``images``, as the camera
             has them; ``points``: (n, 6) places and forces.
-        numbers: of ``state``: sum and largest value of each ``module``, or each ``taxel``.
+        numbers: of ``state``: sum and largest value of each ``module``, each ``taxel``, or place and force (``point``).
         size: height and width of images.
         colours: of images.
         value_range: of the darkest and brightest colour; None: of the sensor type.
@@ -95,7 +96,7 @@ class LearningSet:
     each_structure: bool = False
     by_marks: bool = False
     form: Literal["tactile", "state", "images", "points"] = "tactile"
-    numbers: Literal["module", "taxel"] = "module"
+    numbers: Each = "module"
     size: tuple[int, int] = (64, 64)
     colours: Literal["grey", "signed", "log"] = "grey"
     value_range: tuple[float, float] | None = None

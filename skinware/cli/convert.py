@@ -108,6 +108,14 @@ _learning_options = cli.options(
         metavar="LOWEST..HIGHEST",
         help="lerobot, as images: darkest and brightest value.  [default: of the sensor type]",
     ),
+    click.option("--video", is_flag=True, help="lerobot: images as videos: small, and not exact."),
+    click.option(
+        "--resample",
+        type=click.Choice(["previous", "nearest", "linear"]),
+        default="previous",
+        show_default=True,
+        help="lerobot: the newest sample at a row, the nearest, or values between the two around it.",
+    ),
     click.option(
         "--gap",
         type=cli.seconds,
@@ -305,7 +313,7 @@ def _learning_set(
         at=options["at"],
         each_structure=options["each_structure"],
         by_marks=options["marks"],
-        **{name: options[name] for name in ("form", "numbers", "size", "colours", "value_range")},
+        **{name: options[name] for name in ("form", "numbers", "size", "colours", "value_range", "resample", "video")},
     )
     return convert_to_learning_set([file, *options["also"]], output, wanted, selection, **time_and_end)
 

@@ -46,9 +46,6 @@ prepare_environment() {
         fi
     fi
     echo "installing skinware[$extra]" >&2
-    # uv installs in half the time; it does not read pip's configuration, so pip installs where uv cannot
-    if ! { "$venv/bin/python" -m pip install -qq uv && "$venv/bin/uv" pip install --quiet --python "$venv" --editable "$project[$extra]"; } 2>/dev/null; then
-        "$venv/bin/python" -m pip install -qq --no-compile --editable "$project[$extra]" # Python compiles what it imports
-    fi
+    "$venv/bin/python" -m pip install -qq --no-compile --editable "$project[$extra]" # Python compiles what it imports
     echo "$wanted $(compiled)" >"$stamp"
 }

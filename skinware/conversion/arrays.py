@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import io
+import contextlib
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,7 +31,11 @@ _DESCRIPTION = "recording"
 
 
 def write_npz(source: TableSource, path: Path) -> None:
-    """Write a source, in one pass for each array, which must be whole before the next one begins."""
+    """Write a source, in one pass for each array, which must be whole before the next one begins.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         units = []
         for table in source.tables:
@@ -68,47 +72,72 @@ _CHUNK_BYTES = 256 << 10
 """Bytes of an array that HDF5 reads at once."""
 
 
-class _GuardedFile(io.FileIO):
+class _GuardedFile:
     """A file for HDF5 that keeps errors to itself, because the library does not survive a full disk.
 
     Attributes:
         failure: the first error; nothing is written after it.
     """
 
-    failure: OSError | None = None
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("x+b", buffering=0)
+        self._path = path
+        self.failure: OSError | None = None
 
     def write(self, data: Any) -> int:
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:
             while rest and self.failure is None:
-                rest = rest[super().write(rest) :]
+                rest = rest[self._file.write(rest) :]
         except OSError as error:
-            self.failure = OSError(error.errno, error.strerror, self.name)
+            self.failure = OSError(error.errno, error.strerror, str(self._path))
         return size
 
     def readinto(self, buffer: Any) -> int:
-        """Read, and fill up with zeros beyond the end."""
         into = memoryview(buffer).cast("B")
         into[:] = bytes(len(into))
-        super().readinto(into)
+        self._file.readinto(into)
         return len(into)
 
-    def truncate(self, size: int | None = None) -> int:
+    def read(self, size: int) -> bytes:
+        data = bytearray(size)
+        self.readinto(data)
+        return bytes(data)
+
+    def truncate(self, size: int) -> None:
         try:
-            return super().truncate(size)
+            self._file.truncate(size)
         except OSError as error:
-            self.failure = self.failure or OSError(error.errno, error.strerror, self.name)
-            return 0
+            self.failure = self.failure or OSError(error.errno, error.strerror, str(self._path))
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def flush(self) -> None:
+        """Do nothing: writes are not buffered."""
 
     def check(self) -> None:
         if self.failure is not None:
             raise self.failure
 
+    def close(self) -> None:
+        self._file.close()
+
 
 def write_hdf5(source: TableSource, path: Path) -> None:
+    """Write a source.
+
+    Raises:
+        ConfigurationError: HDF5 cannot hold the names of its arrays.
+        MissingExtra: h5py is not installed.
+        OSError: it cannot be written.
+    """
     hdf5 = package("h5py", "HDF5")
-    with _GuardedFile(str(path), "x+") as stream:
+    with contextlib.closing(_GuardedFile(path)) as stream:
         with hdf5.File(stream, "w") as file:
             units = [_write_table(file.create_group(table.name), table, stream) for table in source.tables]
             file.create_dataset(_DESCRIPTION, data=np.frombuffer(description(source, units), np.uint8))

@@ -28,6 +28,7 @@ from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
 from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
+from skinware_drivers.serial.papillarray import PapillArrayDriver
 from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.robotiq_tsf import RobotiqTsfDriver
 from skinware_drivers.serial.skintalk import SkintalkDriver
@@ -59,6 +60,7 @@ from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
 from skinware_drivers.virtual.devices.inspire import EmulatedInspire
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
+from skinware_drivers.virtual.devices.papillarray import EmulatedPapillArray
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2
 from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3
@@ -387,6 +389,17 @@ class TestFlexiTacText(DriverConformance):
 class TestAbilityHand(DriverConformance):
     driver = AbilityHandDriver
     emulator = EmulatedAbilityHand
+
+
+class TestPapillArray(DriverConformance):
+    """Two sensors; whole numbers are slip states, the others thousandths."""
+
+    driver = PapillArrayDriver
+    emulator = EmulatedPapillArray
+
+    def shown(self, felt: Sequence[int]) -> Sequence[Any]:
+        states = (*range(60, 69), 78)
+        return [value if at % 81 in states else float(np.float32(value / 1e3)) for at, value in enumerate(felt)]
 
 
 def with_resultant(bytes_felt: Sequence[int]) -> list[int]:

@@ -48,6 +48,7 @@ ROWS = (
     Row("inspire", "5122", 112, 1062, "live", "polls_unanswered"),  # a register of the palm
     Row("linkerhand", "0xb1", 72, 360, "live", "polls_unanswered"),  # the rows of the thumb
     Row("openpatch", "module1", 12, 48, "live", ""),  # the message of a module
+    Row("papillarray", "slip", 6, 162, "live", ""),  # a block of the packet
     Row("paxini", "data", 156, 156, "stale", "polls_unanswered"),  # the answers with forces
     Row("revo2", "4200", 20, 20, "stale", "polls_unanswered"),  # a register of the fingertips
     Row("revo3", "4200", 124, 416, "live", "polls_unanswered"),  # a register of a pad, with all that its question reads

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.framing import Framing
+from skinware_drivers.serial.papillarray_packets import PapillArrayPackets
 from skinware_drivers.serial.robotiq_tsf import RobotiqPackets
 from skinware_drivers.serial.stream import PythonStream
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _Matrix
@@ -25,6 +26,7 @@ from skinware_drivers.streams.xela_server import XelaMessages
 from skinware_drivers.streams.yarp_messages import YarpMessages
 from skinware_drivers.virtual.devices.dex3 import EmulatedDex3, EmulatedDex3Options
 from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
+from skinware_drivers.virtual.devices.papillarray import EmulatedPapillArray, EmulatedPapillArrayOptions
 from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf, EmulatedRobotiqTsfOptions
 from skinware_drivers.virtual.devices.ros2 import EmulatedRos2, EmulatedRos2Options
 from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
@@ -78,6 +80,11 @@ def _robotiq() -> tuple[Framing, list[bytes]]:
     return RobotiqPackets(), fingertips.answers(bytes.fromhex("9a00580105"), 500)
 
 
+def _papillarray() -> tuple[Framing, list[bytes]]:
+    controller = Spoken(EmulatedPapillArray(EmulatedPapillArrayOptions()))
+    return PapillArrayPackets(), controller.answers(b"S\n", 100)
+
+
 def _dsa() -> tuple[Framing, list[bytes]]:
     driver = WeissDsaDriver(WeissDsaOptions(rle_offset=5))
     driver._cells = (_Matrix(6, 14, 3.4, 3.4), _Matrix(6, 13, 3.4, 3.4))
@@ -92,6 +99,7 @@ DEVICES: dict[str, Callable[[], tuple[Framing, list[bytes]]]] = {
     "yarp": _yarp,
     "icub_eth": _icub,
     "dex3": _dex3,
+    "papillarray": _papillarray,
     "robotiq_tsf": _robotiq,
     "ros2": _ros2,
     "weiss_dsa": _dsa,

@@ -70,6 +70,7 @@ SHOWN: Mapping[str, Shown] = {
     "icub_eth": Shown(),
     "inspire": Shown("modbus:tcp://127.0.0.1:6055", emulator=("--bus", "modbus:tcp://:6055")),
     "linkerhand": Shown(),
+    "papillarray": _pty("--period-ms", "10", driver=("--rate-hz", "100")),
     "paxini": _pty("--board", "high_speed"),
     "revo2": _pty(bus="modbus:{port}", driver=("--enable",)),
     "revo3": _pty(bus="modbus:{port}"),

@@ -69,9 +69,8 @@ class Card {
   /** The line of the last seconds. */
   #draw() {
     const series = this.plotting.seriesOf(this.probe);
-    const until_ns = this.plotting.until(this.probe);
-    if (!series || this.drawn === until_ns) return;
-    this.drawn = until_ns;
+    if (!series || this.drawn === series.newest_ns) return;
+    this.drawn = series.newest_ns;
     const window = { from: this.drawn - 1e9 * SHOWN_S, to: this.drawn, width: WIDTH };
     const pieces = piecesOf(series.times, series.values, window);
     const [low, high] = rangeOf(pieces) ?? [null, null];

@@ -211,17 +211,15 @@ function takeState(state) {
   now.recording = state.recording ?? null;
   plotting.takeState(state);
   tree.update(skin, states);
-  list.update(now.problems, plotting.server_ns);
+  list.update(now.problems, plotting.now_ns);
   showRecording(byId("record"), now.recording);
 }
 
 function takeReplays({ replays = replay.replays, outlines = now.outlines }) {
   now.outlines = outlines;
-  const [wasPaused, before_ns] = [replay.isPaused, plotting.now_ns];
+  const wasPaused = replay.isPaused;
   replay.update(replays, outlines);
-  plotting.takeReplays(replays, outlines);
-  const hasMoved = plotting.isRecorded && plotting.now_ns !== before_ns;
-  if (replays.length && (replay.isPaused !== wasPaused || (replay.isPaused && hasMoved))) plotting.strips.freeze(replay.isPaused);
+  if (replays.length && replay.isPaused !== wasPaused) plotting.strips.freeze(replay.isPaused);
   setHidden(byId("rewind"), replays.length > 0);
   if (moments.take(replays)) keep();
 }

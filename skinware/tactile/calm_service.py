@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,11 +12,10 @@ import numpy.typing as npt
 
 from skinware.driver_service import DriverWriter
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import ConfigurationError, StructureError
+from skinware.errors import ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request
-from skinware.service.messages import ACQUIRE
 from skinware.state import count_reasons
 from skinware.status import Why
 from skinware.tactile import contacts_service, health_service, motion_service
@@ -75,33 +73,14 @@ class CalmRequests:
 
     def answer(self, writer: DriverWriter) -> None:
         """Answer the requests that have come; those for a frame wait for :meth:`published`."""
-        writer.keep_files()
-        self._waiting = [(asked_ns, request) for asked_ns, request in self._waiting if not request.cancelled]
-        for request in writer.request_server().take():
-            if request.operation == ACQUIRE:
-                self._waiting.append((now_ns(), request))
-                continue
-            operation = self.operations[request.operation]
-            try:
-                inspect.signature(operation).bind(**request.arguments)
-            except TypeError as error:
-                request.fail(f"{request.operation}: {error}", "refused")
-                continue
-            try:
-                result = operation(**request.arguments)
-            except (ConfigurationError, StructureError) as error:
-                request.fail(f"{request.operation}: {error}")
-            else:
-                request.reply(result, writer.position)
+        self._waiting += [(now_ns(), request) for request in writer.answer_requests()]
 
     def published(self, acquired_ns: int, writer: DriverWriter) -> None:
         """Answer the requests for a frame that came before the newest frame was acquired."""
-        waiting, self._waiting = self._waiting, []
-        for asked_ns, request in waiting:
+        for asked_ns, request in self._waiting:
             if acquired_ns >= asked_ns:
                 request.reply(position=writer.position)
-            else:
-                self._waiting.append((asked_ns, request))
+        self._waiting = [(asked_ns, of) for asked_ns, of in self._waiting if acquired_ns < asked_ns]
 
     def _baselines(self, type_name: str | None) -> dict[str, Baseline]:
         if self.chain is None:

@@ -154,17 +154,15 @@ class ContactsWriter(SourceWriter):
     ) -> None:
         self._tracking = tracking
         self._contacts = Contacts.of(structure, type_name, neighbours, tracking)
-        source = _source(structure, type_name, driver, self._contacts)
-        super().__init__(source, name, f"contacts of {driver or 'a skin'}, {type_name}", **options)
+        super().__init__(_source(structure, type_name, driver, self._contacts), name, **options)
 
     def publish(self, value: npt.NDArray[Any], touched: Flags, acquired_ns: int, **more: Unpack[More]) -> ContactSet:
         """Find the contacts of the next frame, and publish them.
 
-        Arguments as of :meth:`.Contacts.update`; raises ConfigurationError as that, and as
-        :meth:`skinware.service.ServiceWriter.begin`.
+        Arguments as of :meth:`.Contacts.update`; raises ConfigurationError as that, and as ``begin``.
         """
         found = self._contacts.update(value, touched, acquired_ns, **more)
-        columns = self._service.begin()
+        columns = self.begin()
         for name in COLUMNS:
             column = columns[name]
             column[: len(found)] = getattr(found, name)
@@ -172,10 +170,10 @@ class ContactsWriter(SourceWriter):
         columns["frame"][len(found) :] = -1
         columns["contact_of"][:] = found.contact_of
         columns["count"][:], columns["beyond"][:] = len(found), found.beyond
-        self._service.commit(acquired_ns)
+        self.commit(acquired_ns)
         return found
 
-    def restructure(self, structure: Structure, *, neighbours: npt.NDArray[Any] | None = None) -> None:
+    def go_on(self, structure: Structure, *, neighbours: npt.NDArray[Any] | None = None) -> None:
         """Go on with other sensors, as a new generation. All contacts end.
 
         Raises:
@@ -184,7 +182,7 @@ class ContactsWriter(SourceWriter):
         """
         type_name = self.source.type_name
         contacts = Contacts.of(structure, type_name, neighbours, self._tracking)
-        self._restructure(_source(structure, type_name, self.source.driver, contacts))
+        self._go_on(_source(structure, type_name, self.source.driver, contacts))
         self._contacts = contacts
 
 

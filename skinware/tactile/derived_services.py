@@ -10,8 +10,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
-from typing import Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +30,7 @@ from skinware.tactile.neighbours import neighbours, posed
 from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
 from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE
-from skinware.tactile.source_service import ServiceOptions, SourceWriter
+from skinware.tactile.source_service import ServiceOptions, Source, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -46,17 +45,17 @@ class DerivedService(ABC, Generic[WriterT]):
     If another program has a service of this name, the name of the driver and a hyphen come before it.
     """
 
-    subject: str  # for messages
+    kind: ClassVar[str]
 
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
         self._name, self._driver = name, driver
         self._options: ServiceOptions = {"namespace": into, "group": group}
-        self._writer: WriterT | None = None
+        self.writer: WriterT | None = None
 
     @property
     def name(self) -> str:
         """Name of the service; empty while there is none."""
-        return "" if self._writer is None else self._writer.name
+        return "" if self.writer is None else self.writer.name
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
         """Go on with another chain, of other sensors, at the nominal rate of the driver."""
@@ -68,16 +67,16 @@ class DerivedService(ABC, Generic[WriterT]):
 
     def close(self) -> None:
         """Withdraw the service. Idempotent."""
-        if self._writer is not None:
-            self._writer.close()
-        self._writer = None
+        if self.writer is not None:
+            self.writer.close()
+        self.writer = None
 
-    def _open(self, make: Callable[..., WriterT]) -> None:
+    def _open(self, make: Callable[..., WriterT], *given: Any, **options: Any) -> None:
         """Make the writer, under the first name that is free; raises NameInUse if none is."""
         try:
-            self._writer = make(name=self._name, **self._options)
+            self.writer = make(*given, name=self._name, **options, **self._options)
         except NameInUse:
-            self._writer = make(name=f"{self._driver}-{self._name}", **self._options)
+            self.writer = make(*given, name=f"{self._driver}-{self._name}", **options, **self._options)
 
     @contextmanager
     def _or_none(self) -> Iterator[None]:
@@ -86,7 +85,7 @@ class DerivedService(ABC, Generic[WriterT]):
             yield
         except (ConfigurationError, NameInUse) as error:
             self.close()
-            log.warning("no %s of %r: %s", self.subject, self._driver, str(error))
+            log.warning("no %s of %r: %s", self.kind, self._driver, str(error))
 
 
 class Loads:
@@ -155,7 +154,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
     Poses of coordinate frames on the robot, (4, 4) by name, let contacts hang together across their borders.
     """
 
-    subject = "contacts"
+    kind = "contacts"
 
     def __init__(
         self,
@@ -176,7 +175,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
         super().follow(chain, rate_hz)
         if self.motion is not None:
-            self.motion.contacts = self._writer
+            self.motion.source = None if self.writer is None else self.writer.source
             self.motion.follow(chain, rate_hz)
 
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
@@ -187,22 +186,21 @@ class CalmContacts(DerivedService[ContactsWriter]):
         structure, type_name, beside = chain.structure, self._loads.type_name, None
         if structure.geometry is not None and self._poses:
             beside = neighbours(posed(structure.geometry[structure.index(type_name)], self._poses))
-        if self._writer is not None and self._writer.source.type_name == type_name:
-            self._writer.restructure(structure, neighbours=beside)
-            return
-        super().close()
-        self._open(
-            partial(ContactsWriter, structure, type_name, driver=self._driver, neighbours=beside, rate_hz=rate_hz)
-        )
+        if self.writer is not None and self.writer.source.type_name == type_name:
+            self.writer.go_on(structure, neighbours=beside)
+        else:
+            super().close()
+            more = {"driver": self._driver, "neighbours": beside, "rate_hz": rate_hz}
+            self._open(ContactsWriter, structure, type_name, **more)
 
     def publish(self, values: Floats, status: Bytes, acquired_ns: int) -> None:
         """Find the contacts in the (n_sensors,) output of the chain, and publish them."""
-        if self._writer is None or self._loads is None:
+        if self.writer is None or self._loads is None:
             return
         usable, loads = self._loads.usable(status), self._loads.values(values)
-        more = self._loads.more(usable, self._writer.source.unit)
+        more = self._loads.more(usable, self.writer.source.unit)
         with self._or_none():
-            found = self._writer.publish(loads, self._loads.touched & usable, acquired_ns, **more)
+            found = self.writer.publish(loads, self._loads.touched & usable, acquired_ns, **more)
             self.count = len(found)
             if self.motion is not None:
                 self.motion.publish(found, loads, acquired_ns)
@@ -221,27 +219,25 @@ class CalmContacts(DerivedService[ContactsWriter]):
 
 
 class CalmMotion(DerivedService[MotionWriter]):
-    """The motion of the regions of one calmed driver, while there is a service of its contacts."""
+    """The motion of the regions of one calmed driver, beside its contacts of this ``source``; None: there are none."""
 
-    subject = "motion"
+    kind = "motion"
 
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None, regions: Regions) -> None:
         super().__init__(name, driver, into, group)
-        self.contacts: ContactsWriter | None = None
+        self.source: Source | None = None
         self._regions = regions
 
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
         self.close()
-        if self.contacts is None:
-            return
-        source = self.contacts.source
-        given = chain.structure, source.type_name, self._regions, source.frames
-        self._open(partial(MotionWriter, *given, driver=self._driver, rate_hz=rate_hz))
+        if self.source is not None:
+            given = chain.structure, self.source.type_name, self._regions, self.source.frames
+            self._open(MotionWriter, *given, driver=self._driver, rate_hz=rate_hz)
 
     def publish(self, contacts: ContactSet, values: Floats, acquired_ns: int) -> None:
-        if self._writer is not None:
+        if self.writer is not None:
             with self._or_none():
-                self._writer.publish(contacts, values, acquired_ns)
+                self.writer.publish(contacts, values, acquired_ns)
 
 
 class CalmHealth(DerivedService[HealthWriter]):
@@ -252,7 +248,7 @@ class CalmHealth(DerivedService[HealthWriter]):
         faulty: number of sensors with a fault.
     """
 
-    subject = "health"
+    kind = "health"
 
     def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
         super().__init__(name, driver, into, group)
@@ -261,16 +257,15 @@ class CalmHealth(DerivedService[HealthWriter]):
         self._status: Bytes = np.zeros(0, np.uint8)
         self._due_ns = 0
 
-    def _follow(self, chain: Chain, rate_hz: float | None) -> None:
-        del rate_hz  # it has a rate of its own
+    def _follow(self, chain: Chain, rate_hz: float | None) -> None:  # noqa: ARG002 - it has a rate of its own
         self.judged, self.faulty = ChainHealth(chain, self._driver), 0
         self._status = np.zeros(chain.structure.n_sensors, np.uint8)
         if not self.judged:
             self.close()
-        elif self._writer is not None:
-            self._writer.restructure(chain.structure)
+        elif self.writer is not None:
+            self.writer.go_on(chain.structure)
         else:
-            self._open(partial(HealthWriter, chain.structure, self._driver))
+            self._open(HealthWriter, chain.structure, self._driver)
 
     def step(self, status: Bytes, acquired_ns: int) -> None:
         """Take in what the chain made of the next frame; mark sensors with a fault in (n_sensors,) status."""
@@ -282,7 +277,7 @@ class CalmHealth(DerivedService[HealthWriter]):
             reports = self.judged.reports()
             self._status = np.uint8(Status.UNHEALTHY) * self.judged.faulty(reports)
             self.faulty = int(np.count_nonzero(self._status))
-            if self._writer is not None:
+            if self.writer is not None:
                 with self._or_none():
-                    self._writer.publish(reports, acquired_ns)
+                    self.writer.publish(reports, acquired_ns)
         status |= self._status

@@ -73,16 +73,16 @@ class HealthWriter(SourceWriter):
         self._structure = structure
         source = Source(driver, uid=structure.sensor_uid, type_id=structure.sensor_type)
         given: ServiceOptions = {"slots": 4, "rate_hz": RATE_HZ, **options}
-        super().__init__(source, name, f"health of the sensors of {driver}", **given)
+        super().__init__(source, name, **given)
 
     def publish(self, reports: Mapping[str, HealthReport], acquired_ns: int) -> None:
         """Publish the present reports by type of sensors; nothing is known of the others.
 
         Raises:
             StructureError: the driver has no such sensors.
-            Closed, Paused, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
+            Closed, Paused, NameInUse: as ``begin``.
         """
-        columns = self._service.begin()
+        columns = self.begin()
         for name, nothing in NOTHING.items():
             columns[name][:] = nothing
             for type_name, report in reports.items():
@@ -91,11 +91,11 @@ class HealthWriter(SourceWriter):
                     positions = np.arange(len(self._structure.sensor_uid))[index]
                     values = np.where(values >= 0, positions[values], values)
                 columns[name][index] = values
-        self._service.commit(acquired_ns)
+        self.commit(acquired_ns)
 
-    def restructure(self, structure: Structure) -> None:
+    def go_on(self, structure: Structure) -> None:
         """Go on with other sensors, as a new generation; raises NamespaceError, and then the old one goes on."""
-        self._restructure(Source(self.source.driver, uid=structure.sensor_uid, type_id=structure.sensor_type))
+        self._go_on(Source(self.source.driver, uid=structure.sensor_uid, type_id=structure.sensor_type))
         self._structure = structure
 
 

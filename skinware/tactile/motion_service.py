@@ -87,16 +87,16 @@ class MotionWriter(SourceWriter):
         if not self._index:
             raise ConfigurationError(f"no region is of {type_name} sensors")
         source = Source(driver, type_name, structure.type(type_name).unit, frames, tuple(self._index))
-        super().__init__(source, name, f"motion over regions of {driver or 'a skin'}, {type_name}", **options)
+        super().__init__(source, name, **options)
 
     def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:
         """Publish the motion of the next frame, by its contacts and (n,) calmed values.
 
-        Raises as :meth:`skinware.service.ServiceWriter.begin`.
+        Raises as ``begin``.
         """
         found = motion_of(self._index, contacts, value)
-        columns = self._service.begin()
+        columns = self.begin()
         for name in COLUMNS:
             columns[name][:] = getattr(found, name)
-        self._service.commit(acquired_ns)
+        self.commit(acquired_ns)
         return found

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Self, TypedDict, Unpack, cast
+from typing import Any, ClassVar, TypedDict, Unpack, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ from skinware.tactile.arrays import Arrays, Columns
 
 
 class ServiceOptions(TypedDict, total=False):
-    """Options of :class:`skinware.service.ServiceWriter` that every writer takes."""
+    """Options of every writer, as of :class:`skinware.service.ServiceWriter`."""
 
     namespace: Namespace | str | None
     slots: int | None
@@ -102,39 +102,20 @@ class ServiceForm:
         return columns, static
 
 
-class SourceWriter:
-    """Publishes a service of one kind.
-
-    Attributes:
-        form: of the service.
-        source: the present source of the service.
-    """
+class SourceWriter(ServiceWriter):
+    """Publishes a service of one kind, whose form is ``form``; ``source`` is its present source."""
 
     form: ClassVar[ServiceForm]
 
-    def __init__(self, source: Source, name: str, description: str, **options: Unpack[ServiceOptions]) -> None:
-        self.source = source
-        columns = self.form.columns(source)
-        self._service = ServiceWriter(name, *columns, kind=self.form.kind, description=description, **options)
-
-    @property
-    def name(self) -> str:
-        """Name of the service."""
-        return self._service.name
-
-    def _restructure(self, source: Source) -> None:
-        self._service.restructure(*self.form.columns(source))
+    def __init__(self, source: Source, name: str, **options: Unpack[ServiceOptions]) -> None:
+        kind, of_type = self.form.kind, f", {source.type_name}" if source.type_name else ""
+        description = f"{kind} of {source.driver or 'a skin'}{of_type}"
+        super().__init__(name, *self.form.columns(source), kind=kind, description=description, **options)
         self.source = source
 
-    def close(self) -> None:
-        """Withdraw the service. Idempotent."""
-        self._service.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def _go_on(self, source: Source) -> None:
+        self.restructure(*self.form.columns(source))
+        self.source = source
 
 
 class SourceSample(Sample):

@@ -155,7 +155,7 @@ def test_services_that_come_and_go_are_followed() -> None:
         assert frame is not None
         assert len(frame.contacts) == 2
         assert contacts.of("b") is None
-        writer.restructure(fake_structure(1, 2))
+        writer.go_on(fake_structure(1, 2))
         assert contacts.of("a") is None  # nothing published yet
         value = np.arange(20) == 3
         writer.publish(value * 5.0, value, now_ns())

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverWriter, Namespace, PatchState, Status
-from skinware.errors import ConfigurationError, NameInUse, RequestFailed, RequestRefused, ServiceError, SkinwareError
+from skinware.errors import ConfigurationError, NameInUse, RequestFailed, ServiceError, SkinwareError
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_service import CalmService
 from skinware.tactile.chain import ChainSettings
@@ -136,7 +136,7 @@ def test_operations_and_what_they_refuse() -> None:
         ):
             with pytest.raises(RequestFailed, match=words):
                 reader.call(operation, **arguments)
-        with pytest.raises(RequestRefused, match="unexpected keyword"):
+        with pytest.raises(RequestFailed, match="unexpected keyword"):
             reader.call("tare", board=7)
         assert skin.writer.sequence
 

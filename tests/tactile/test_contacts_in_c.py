@@ -48,7 +48,7 @@ def test_a_c_program_reads_contacts_over_a_change_of_the_skin(
             assert seen == ["2 contacts\n", f"  1: load 30 at {at(45)}\n", f"  2: load 5.5 at {at(390)}\n"]
             publish(writer, 400)
             assert next(lines) == "0 contacts\n"
-            writer.restructure(structure(rows=3))
+            writer.go_on(structure(rows=3))
             publish(writer, 60, t7=4.0)
             assert [next(lines), next(lines)] == ["1 contacts\n", f"  1: load 4 at {at(7)}\n"]
 

@@ -127,7 +127,7 @@ def test_a_reader_goes_on_with_other_sensors_when_it_says_so(namespace: Namespac
     ):
         writer.publish(np.ones(400), np.ones(400, bool), 1)
         frame = contacts.read(timeout_s=10)
-        writer.restructure(structure(rows=10))
+        writer.go_on(structure(rows=10))
         writer.publish(np.ones(200), np.ones(200, bool), 2)
         with pytest.raises(StructureChanged):
             contacts.read(newer_than=frame, timeout_s=10)
@@ -135,7 +135,7 @@ def test_a_reader_goes_on_with_other_sensors_when_it_says_so(namespace: Namespac
         assert len(contacts.source.uid) == 200
         assert contacts.read(timeout_s=10).contacts.n.tolist() == [200]
         with pytest.raises(StructureError):
-            writer.restructure(
+            writer.go_on(
                 structure().replace(
                     types=(TEMPERATURE, PRESSURE.measured()),
                     geometry=None,

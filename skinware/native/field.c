@@ -1,6 +1,7 @@
 /*
- * Take a uniform field off the values of arrays of three-axis taxels. A value is level + response * field + load + noise.
- * The field is where most taxels of an array agree: those at rest, or else those whose loads stay as they are.
+ * Take a uniform field off the values of arrays of three-axis taxels: tests/specification/field.py.
+ * A value is level + response * field + load + noise. The field is where most taxels of an array agree: those at rest,
+ * or else those whose loads stay as they are.
  */
 
 #include "field.h"

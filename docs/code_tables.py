@@ -22,7 +22,7 @@ from sphinx.util.docutils import SphinxDirective
 from skinware.service import Column
 from skinware.tactile.contacts_service import ContactsReader
 from skinware.tactile.health_service import HealthReader
-from skinware.tactile.motion_service import MotionReader
+from skinware.tactile.motion import MotionReader
 from skinware.tactile.source_service import Source
 
 FORMS = {reader.form.kind: reader.form for reader in (ContactsReader, MotionReader, HealthReader)}

@@ -30,7 +30,7 @@ from skinware.recording.replaying import Replayer
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.contacts_service import ContactsWriter
-from skinware.tactile.motion_service import MotionWriter
+from skinware.tactile.motion import MotionWriter
 from skinware.tactile.regions import Region, Regions
 from skinware.tactile.testing import Surface
 from skinware.tactile.tracking import TrackingSettings

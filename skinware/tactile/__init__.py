@@ -25,11 +25,9 @@ if TYPE_CHECKING:
     from skinware.tactile.contacts import Contact, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsReader
     from skinware.tactile.curves import read_curves
-    from skinware.tactile.health import Health, HealthSettings
-    from skinware.tactile.health_report import HealthKind, HealthReport
+    from skinware.tactile.health import Health, HealthKind, HealthReport, HealthSettings
     from skinware.tactile.health_service import HealthReader
-    from skinware.tactile.motion import MotionSet, motion_of
-    from skinware.tactile.motion_service import MotionReader
+    from skinware.tactile.motion import MotionReader, MotionSet, motion_of
     from skinware.tactile.onsets import ContactEvent, EventKind
     from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions
     from skinware.tactile.rule import BaselineSettings
@@ -76,7 +74,6 @@ _MODULES = (
     "motion",
     "contacts_service",
     "health_service",
-    "motion_service",
     "onsets",
 )
 """The modules that have these names, those that import little first."""

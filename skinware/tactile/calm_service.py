@@ -18,12 +18,13 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import Request
 from skinware.state import count_reasons
 from skinware.status import Why
-from skinware.tactile import contacts_service, health_service, motion_service
+from skinware.tactile import contacts_service, health_service
 from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_driver import CalmedDriver, DriverSource
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState
 from skinware.tactile.derived_services import CalmContacts, CalmHealth
+from skinware.tactile.motion import NAME as MOTION
 from skinware.tactile.regions import Regions
 
 log: logging.Logger = logging.getLogger("skinware.calm")
@@ -131,7 +132,7 @@ class CalmService:
         state_path: Path | None = None,
         contacts: str | None = contacts_service.NAME,
         regions: Regions | None = None,
-        motion: str = motion_service.NAME,
+        motion: str = MOTION,
         poses: Mapping[str, npt.ArrayLike] | None = None,
         health: str | None = health_service.NAME,
     ) -> None:

@@ -19,13 +19,13 @@ from skinware.errors import ConfigurationError, NameInUse
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware.tactile import motion_service
 from skinware.tactile.arrays import Bytes, Flags, Floats
 from skinware.tactile.chain import Chain
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
-from skinware.tactile.motion_service import MotionWriter
+from skinware.tactile.motion import NAME as MOTION
+from skinware.tactile.motion import MotionWriter
 from skinware.tactile.neighbours import neighbours, posed
 from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
@@ -163,7 +163,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
         into: Namespace,
         group: str | None = None,
         regions: Regions | None = None,
-        motion: str = motion_service.NAME,
+        motion: str = MOTION,
         poses: Mapping[str, npt.ArrayLike] | None = None,
     ) -> None:
         super().__init__(name, driver, into, group)

@@ -1,36 +1,41 @@
-"""Compute the motion of regions from the velocities of their contacts.
+"""Compute, publish and read the motion of regions, by the velocities of their contacts.
 
-A contact has a velocity of its own (:mod:`skinware.tactile.contacts`). The velocity of a region is the mean over its
-contacts, each weighted by its load in the region. So a finger that comes or goes moves nothing, while it would move the
-centre of all load.
+The velocity of a region is the mean over its contacts, each weighted by its load in the region. So a finger that comes
+or goes moves nothing, while it would move the centre of all load.
+
+Columns of a sample of the service ``motion``: those of :data:`COLUMNS`, a row for each region. Static columns:
+``region_name``, ``frame_name``, ``driver``, ``type_name`` and ``type_unit``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import Index
+from skinware.errors import ConfigurationError
+from skinware.skin_layout import SkinLayout
+from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Columns, Doubles, Floats, rows_of
 from skinware.tactile.contacts import ContactSet
+from skinware.tactile.regions import Regions
+from skinware.tactile.source_service import (
+    ServiceForm,
+    ServiceOptions,
+    Source,
+    SourceReader,
+    SourceSample,
+    SourceWriter,
+)
 
 
 @dataclass(frozen=True, eq=False)
 class RegionMotion:
-    """The motion over one region.
-
-    Attributes:
-        name: name of the region.
-        load: sum of the values of its touched taxels, in the unit of the values.
-        contacts: number of contacts that reach into it.
-        velocity_m_s: (3,) m/s; NaN where nothing touches it, or no places are known.
-        speed_m_s: length of the velocity, m/s.
-        frame: name of the coordinate frame, empty if it is not known.
-    """
+    """The motion over one region: attributes as of :data:`COLUMNS`, with the name of its frame (empty: not known)."""
 
     name: str
     load: float
@@ -50,13 +55,8 @@ class RegionMotion:
 class MotionSet:
     """The motion of all r regions in one frame; a sequence of :class:`RegionMotion`.
 
-    Attributes:
-        names: names of the regions.
-        load, speed_m_s: (r,) float32.
-        contacts: (r,) uint32.
-        velocity_m_s: (r, 3) float32.
-        frame: (r,) int16, index into ``frames``; -1 if it is not known.
-        frames: names of the coordinate frames.
+    Each of :data:`COLUMNS` is an array (r, ...); ``names`` are those of the regions, ``frames`` those that ``frame``
+    counts.
     """
 
     names: tuple[str, ...]
@@ -125,3 +125,78 @@ def _velocity(contacts: ContactSet, load: Doubles) -> tuple[Doubles, int]:
     moving = moving[contacts.frame[moving] == frame]
     weight = load[moving] / load[moving].sum()
     return weight @ contacts.velocity_m_s[moving], frame
+
+
+NAME = "motion"
+
+_FORM = ServiceForm(
+    NAME, ("driver", "type_name", "unit", "frames", "regions"), lambda source: rows_of(COLUMNS, len(source.regions))
+)
+
+
+class MotionSample(SourceSample):
+    """The motion of all regions in one frame; iterate over it for each of them."""
+
+    __slots__ = ()
+
+    @property
+    def motion(self) -> MotionSet:
+        """All of it, as arrays."""
+        arrays = {name: self.column(name) for name in COLUMNS}
+        return MotionSet(names=self.source.regions, frames=self.source.frames, **arrays)
+
+    def __iter__(self) -> Iterator[RegionMotion]:
+        return iter(self.motion)
+
+
+class MotionReader(SourceReader[MotionSample]):
+    """Reads the service ``motion``: a :class:`skinware.service.ServiceReader` whose samples are motion.
+
+    Raises:
+        BadServiceFile: the service is of another kind.
+    """
+
+    form = _FORM
+    frame_class = MotionSample
+
+
+class MotionWriter(SourceWriter):
+    """Publishes the motion of regions of a driver, by its contacts, whose coordinate frames have these names.
+
+    Other arguments are as for :class:`skinware.tactile.contacts_service.ContactsWriter`.
+
+    Raises:
+        StructureError: the driver has no such sensors.
+        ConfigurationError: no region may have any.
+    """
+
+    form = _FORM
+
+    def __init__(
+        self,
+        structure: Structure,
+        type_name: str,
+        regions: Regions,
+        frames: tuple[str, ...],
+        *,
+        driver: str = "",
+        name: str = NAME,
+        **options: Unpack[ServiceOptions],
+    ) -> None:
+        self._index = regions.of(SkinLayout((driver,), (structure,)), type_name)
+        if not self._index:
+            raise ConfigurationError(f"no region is of {type_name} sensors")
+        source = Source(driver, type_name, structure.type(type_name).unit, frames, tuple(self._index))
+        super().__init__(source, name, **options)
+
+    def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:
+        """Publish the motion of the next frame, by its contacts and (n,) calmed values.
+
+        Raises as ``begin``.
+        """
+        found = motion_of(self._index, contacts, value)
+        columns = self.begin()
+        for name in COLUMNS:
+            columns[name][:] = getattr(found, name)
+        self.commit(acquired_ns)
+        return found

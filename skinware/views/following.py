@@ -17,7 +17,7 @@ from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
-from skinware.tactile.motion_service import MotionReader, MotionSample
+from skinware.tactile.motion import MotionReader, MotionSample
 from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import LiveDriver, LiveDrivers, LiveSources

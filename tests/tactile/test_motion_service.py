@@ -9,8 +9,7 @@ import pytest
 
 from skinware import Namespace, ServiceWriter
 from skinware.errors import BadServiceFile, ConfigurationError
-from skinware.tactile.motion import COLUMNS
-from skinware.tactile.motion_service import MotionReader, MotionWriter
+from skinware.tactile.motion import COLUMNS, MotionReader, MotionWriter
 from skinware.tactile.regions import Region, Regions
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import running

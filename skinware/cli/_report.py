@@ -24,7 +24,7 @@ from skinware.service import ServiceReader
 from skinware.state import DriverReport, life_of, rate_now_hz, report_of
 from skinware.status import DataPath, load_report
 from skinware.structure import Structure
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import NAME as HEALTH_KIND
 from skinware.tactile.health_service import HealthReader, HealthSample
 from skinware.text import age_text_ms, count_text, plural, table, words, wrapped

@@ -1,4 +1,4 @@
-"""Judge the health of taxels by what they showed in use: stuck, noisy, dead, shorted and other :class:`HealthKind`.
+"""Judge the health of taxels by what they showed in use, and report it with the evidence.
 
 An untouched taxel looks like one that feels nothing, unless both its sides are touched: a thing that presses two taxels
 presses those between them. In a contact that falls off to its edges as a bell does, a taxel in the middle shows at
@@ -8,8 +8,10 @@ test finds out whether they feel anything.
 
 from __future__ import annotations
 
+import enum
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Self
 
 import msgspec
@@ -20,18 +22,16 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
-from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole, check_state
+from skinware.tactile.arrays import Bytes, Columns, Doubles, Flags, Floats, Whole, check_state
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_evidence import Dues, Noise, Use
-from skinware.tactile.health_relations import Copies, Dropouts, Twins, lower_median
-from skinware.tactile.health_report import COLUMNS, HealthKind, HealthReport
-from skinware.tactile.neighbours import NONE, Table, neighbours
+from skinware.tactile.health_relations import Copies, Dropouts, Twins, median_around
+from skinware.tactile.neighbours import Table, neighbours
 from skinware.tactile.rule import resolution_of
 
 _CLEAR = 8.0  # times the noise: a touch this high is no flicker
 _HARD = 0.25  # share of what a taxel usually shows at most: less is the rest of a touch, and no other touch
 _LEAST_NOISE = 0.5  # steps of the values: no taxel counts as quieter
-_FEWEST_AROUND = 3  # neighbours with a known share that a comparison with neighbours needs
 _ALIKE = 0.9  # correlation with the touches of another taxel, from which a taxel shows them
 _SAME = 0.7  # part of another's touches, from which both are shorted
 _SQUARES, _OTHER_SQUARES = 0.0003, 0.03
@@ -40,6 +40,119 @@ _EXCHANGED = 0.5  # share of what is due to another weak taxel, from which a wea
 _OFTEN = 5.0  # times the dropouts of three quarters of the others
 _USUAL = 0.1
 """Share of the time: where typical taxels are at an end of the range for longer, that end is where they rest."""
+
+
+class HealthKind(enum.IntEnum):
+    """The judgement of a taxel; where several apply, the highest."""
+
+    GOOD = 0
+    """Nothing is known to be wrong."""
+    NEVER_TOUCHED = 1
+    """Nothing has touched it yet, so nothing is known."""
+    WEAK = 2
+    """It shows far less of its touches than its neighbours show of theirs."""
+    DYING = 3
+    """It shows far less of its touches than it did before."""
+    DEAD = 4
+    """It shows nothing when both its sides are pressed."""
+    CROSSTALK = 5
+    """It shows a part of the touches of another taxel of its module."""
+    NOISY = 6
+    """Its noise is far above that of the typical taxel."""
+    INTERMITTENT = 7
+    """It loses its value again and again for a moment, while its neighbours keep theirs."""
+    SWAPPED = 8
+    """It shows what presses the place of another taxel: their wires or uids are exchanged."""
+    SHORTED = 9
+    """It shows the same as another taxel."""
+    STUCK = 10
+    """Its value does not change, whatever happens around it."""
+    CLIPPED = 11
+    """It is at an end of the range, untouched: there is no room left for a touch, or for its drift."""
+
+
+@dataclass(frozen=True, eq=False)
+class HealthReport:
+    """The health of n taxels, with the evidence: arrays (n,), whose meaning is in :data:`COLUMNS`.
+
+    NaN: not known (yet). ``other`` is the number of a taxel among the n.
+    """
+
+    kind: Bytes
+    value: Floats
+    still_s: Floats
+    peak: Floats
+    noise: Floats
+    noise_times: Floats
+    clipped: Floats
+    touches: npt.NDArray[np.uint32]
+    shown: Floats
+    shown_around: Floats
+    recent: Floats
+    best: Floats
+    dropouts: Floats
+    other: npt.NDArray[np.int32]
+    other_shown: Floats
+
+    @classmethod
+    def unknown(cls, n: int) -> Self:
+        """Make a report of n taxels about which nothing is known."""
+        return cls(**{name: np.full(n, NOTHING[name], dtype) for name, (dtype, *_) in COLUMNS.items()})
+
+    @property
+    def faulty(self) -> Flags:
+        """(n,) bool: which taxels have a fault."""
+        faulty: Flags = self.kind > HealthKind.NEVER_TOUCHED
+        return faulty
+
+    def evidence(self, taxel: int, unit: str = "", other: str = "") -> str:
+        """Return the reason for the kind of a taxel in words, with its unit and the name of the one that it shows."""
+        of = {name: getattr(self, name)[taxel].item() for name in COLUMNS}
+        of |= {name: 100 * of[name] for name in _SHARES}
+        words = {"unit": f" {unit}".rstrip(), "other": other or f"taxel {of['other']}", "shown": max(of["shown"], 0)}
+        return _EVIDENCE.get(HealthKind(of["kind"]), "").format(**of | words)
+
+
+_SHARES = ("clipped", "shown", "shown_around", "recent", "best", "other_shown")
+_OF_DUE = "shows {shown:.0f} % of what presses both its sides"
+_OF_OTHER = "shows {other_shown:.0f} % of what presses {other}"
+_EVIDENCE = {
+    HealthKind.WEAK: _OF_DUE + ", in {touches} touches; its neighbours show {shown_around:.0f} %",
+    HealthKind.DYING: "shows {recent:.0f} % of what presses both its sides; it showed {best:.0f} %",
+    HealthKind.DEAD: _OF_DUE + ", in {touches} touches",
+    HealthKind.CROSSTALK: _OF_OTHER,
+    HealthKind.NOISY: "noise {noise:.3g}{unit}, {noise_times:.1f} times that of the others",
+    HealthKind.INTERMITTENT: "lost its value about {dropouts:.0f} times in ten minutes, unlike its neighbours",
+    HealthKind.SWAPPED: "shows what presses {other}",
+    HealthKind.SHORTED: _OF_OTHER,
+    HealthKind.STUCK: "at {value:.4g}{unit} for {still_s:.0f} s, while its module was touched",
+    HealthKind.CLIPPED: "at {value:.4g}{unit}, an end of the range, for {clipped:.0f} % of the time",
+}
+
+
+COLUMNS: Columns = {
+    "kind": ("u1", (), "", ", ".join(f"{kind:d}: {kind.name.lower().replace('_', ' ')}" for kind in HealthKind)),
+    "value": ("<f4", (), "", "the newest, in the unit of the type"),
+    "still_s": ("<f4", (), "s", "for how long it has not changed"),
+    "peak": ("<f4", (), "", "the most that a touch showed, in the unit of the type"),
+    "noise": ("<f4", (), "", "standard deviation, in the unit of the type"),
+    "noise_times": ("<f4", (), "", "the same in multiples of the typical sensor's"),
+    "clipped": ("<f4", (), "", "share of the time at an end of the range"),
+    "touches": ("<u4", (), "", "separate touches of both its sides"),
+    "shown": ("<f4", (), "", "share of its due that it showed in them"),
+    "shown_around": ("<f4", (), "", "share that its neighbours showed; only where that is much more"),
+    "recent": ("<f4", (), "", "mean share of its last 10 hard touches"),
+    "best": ("<f4", (), "", "largest of these means so far"),
+    "dropouts": ("<f4", (), "", "how often it lost its value; half of it is forgotten in ten minutes"),
+    "other": ("<i4", (), "", "position of the sensor whose touches it shows; -1: none"),
+    "other_shown": ("<f4", (), "", "part of them that it shows"),
+}
+"""Dtype, shape, unit and meaning, per taxel, of each array of a :class:`HealthReport`."""
+NOTHING: dict[str, float] = {name: math.nan if dtype == "<f4" else 0 for name, (dtype, *_) in COLUMNS.items()} | {
+    "dropouts": 0,
+    "other": -1,
+}
+"""The value in each array where nothing is known."""
 
 
 class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -70,7 +183,7 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clipped: float = 0.5
     dead: float = 0.1
     weak: float = 0.25
-    dying: float = 0.3
+    dying: float = 0.5
     dropouts: float = 5.0
     crosstalk: float = 0.05
 
@@ -155,14 +268,14 @@ class Health:
         hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))
         above = given - calm.baseline
         self._dues.add(self._now_s, above, calm, hard)
-        self._copies.add(self._now_s, given, calm.usable, self._clear)
+        self._copies.add(self._now_s, given, calm.usable, self._clear / _CLEAR)
         self._twins.add(self._now_s, above, calm, self._clear / _CLEAR)
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""
         settings, use = self.settings, self._use
         shown = self._dues.share_shown(settings.touches)
-        shown_around = self._median_around(shown, settings.weak)
+        shown_around = median_around(self._neighbours, shown, settings.weak)
         kept = np.where(self._dues.best > 0, self._dues.recent, math.nan) / np.fmax(self._dues.best, 1e-9)
         typical = self._typical_noise()
         noise, at_end = self._noise.deviation, self._noise.at_end
@@ -179,7 +292,7 @@ class Health:
         for name, where in (
             (HealthKind.NEVER_TOUCHED, use.seen & (use.peak <= _CLEAR * np.fmax(noise, typical))),
             (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
-            (HealthKind.DYING, kept < settings.dying * self._median_around(kept, settings.dying)),
+            (HealthKind.DYING, kept < settings.dying * median_around(self._neighbours, kept, settings.dying)),
             (HealthKind.DEAD, dead),
             (HealthKind.CROSSTALK, shows_other == HealthKind.CROSSTALK),
             (HealthKind.NOISY, noise_times > settings.noisy),
@@ -283,15 +396,3 @@ class Health:
         is_held = use.touched[rows] & (in_module[module] > 1)
         found[rows] = touched_since & ~is_held
         return found
-
-    def _median_around(self, shares: Doubles, part: float) -> Doubles:
-        """(n,) the median share of the neighbours, where a taxel's own may be less than a part of it; else NaN."""
-        around = np.full(len(shares), math.nan)
-        most = np.nanmax(shares) if np.isfinite(shares).any() else 0.0
-        rows = np.flatnonzero(shares < part * most)
-        if len(rows):
-            table = self._neighbours[rows]
-            median, count = lower_median(np.where(table == NONE, math.nan, shares[table]))
-            enough = count >= _FEWEST_AROUND
-            around[rows[enough]] = median[enough]
-        return around

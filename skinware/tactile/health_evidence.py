@@ -21,7 +21,8 @@ _MOST_AT_ONCE = 2048  # touched taxels that are compared in one frame; if there 
 _NEAR_PITCHES = 1.3  # pitches: only the nearest ring of neighbours says much about the taxel in the middle
 _OPPOSITE_COSINE = -0.9
 """Cosine of the angle from one neighbour to the other: they are opposite beyond some 155 degrees."""
-_SETTLED_TOUCHES = 20  # touches after which a share is known well
+_SETTLED_TOUCHES = 20  # touches after which what is due is known well
+_RECENT_TOUCHES = 10  # hard touches over which a share is averaged: it is known well then
 _HARD_SQUARE = 0.25  # part of the mean square of what was due: the share of a weaker touch says little
 _BEST_KEPT = 0.9995
 """Part of the best share that a touch leaves: what a taxel showed is forgotten within thousands of touches."""
@@ -194,9 +195,9 @@ class Dues:
         self.exchanges.end(taxels, due)
         hard = due**2 > _HARD_SQUARE * self.due[taxels] / np.clip(self.touches[taxels], 1, _SETTLED_TOUCHES)
         ended, self.hard_touches[taxels] = taxels[hard], self.hard_touches[taxels] + hard
-        count = np.minimum(self.hard_touches[ended], _SETTLED_TOUCHES)
+        count = np.minimum(self.hard_touches[ended], _RECENT_TOUCHES)
         self.recent[ended] += (shown[hard] / due[hard] - self.recent[ended]) / count
-        settled = ended[count == _SETTLED_TOUCHES]
+        settled = ended[count == _RECENT_TOUCHES]
         self.best[settled] = np.maximum(_BEST_KEPT * self.best[settled], self.recent[settled])
 
 

@@ -16,6 +16,7 @@ KEPT = 0.95
 """Weight that older touches keep with each new one: a mended taxel is good again after some touches."""
 APART_S = 1.0
 """Seconds: touches of a taxel with less time between them count as one."""
+_FEWEST_AROUND = 3  # neighbours with a known share that a comparison with neighbours needs
 _MOST_EXCHANGED = 64  # weak taxels that are compared with each other
 _MOST_COMPARED = 1024  # touched taxels that are compared with their neighbours in one frame
 _PLAIN = 24.0  # times the noise: weaker touches do not show whether two taxels are the same
@@ -24,7 +25,8 @@ _STILL_FRAMES = 5  # frames without a large change before a value is lost: noise
 _BACK = 0.2  # share of a jump: the value is back if it differs by less from the one before
 _LOST_S = 2.0  # seconds: what lasts longer is no dropout
 _FORGET_S = 600.0  # seconds in which half of the dropouts are forgotten
-_CHANGE_S = 0.4  # seconds between values that are compared: a slow stroke changes little from one frame to the next
+_CHANGE_S = 0.4  # seconds over which values are averaged: a slow stroke changes little from one frame to the next
+_CLEAR_CHANGE = 6.0  # times the noise of a change: it is no noise
 _BELOW = 0.8  # part of its value that another must show, where a taxel seems to be touched alone
 _MOST_SHARE = 1.25  # part of the touches of another, beyond which they are not the reason of its own
 _MOST_ALONE = 256  # taxels that are compared with all others of their modules
@@ -35,6 +37,18 @@ def lower_median(numbers: npt.NDArray[np.floating[Any]]) -> tuple[npt.NDArray[np
     ordered = np.sort(numbers, axis=1)  # NaN comes last
     count: Whole = (~np.isnan(ordered)).sum(axis=1)
     return ordered[np.arange(len(numbers)), np.maximum(count - 1, 0) // 2], count
+
+
+def median_around(table: Table, shares: Doubles, part: float) -> Doubles:
+    """(n,) the median share of the neighbours, where a taxel's own may be less than a part of it; else NaN."""
+    around = np.full(len(shares), math.nan)
+    most = np.nanmax(shares) if np.isfinite(shares).any() else 0.0
+    rows = np.flatnonzero(shares < part * most)
+    if len(rows):
+        median, count = lower_median(np.where(table[rows] == NONE, math.nan, shares[table[rows]]))
+        enough = count >= _FEWEST_AROUND
+        around[rows[enough]] = median[enough]
+    return around
 
 
 def _most_around(table: Table, taxels: Whole, changes: Floats) -> Floats:
@@ -133,40 +147,61 @@ class Exchanges:
 
 
 class Copies:
-    """Finds taxels that change with another of their module, while their own neighbours do not."""
+    """Finds taxels that change with another of their module, while their own neighbours do not.
+
+    Changes are those of means over some frames, from what the neighbours do: a cover sags round a touch.
+    """
 
     def __init__(self, module: npt.NDArray[np.intp], table: Table) -> None:
         self._module, self._table = module, table
         self._is_known: Flags = (table != NONE).any(axis=1)
+        self._sum: Floats = np.zeros(len(table), np.float32)
+        self._frames = 0
         self._before: Floats = np.full(len(table), np.nan, np.float32)
         self._before_s = -math.inf
         self._alone: dict[int, _Alone] = {}
 
-    def add(self, now_s: float, given: Floats, usable: Flags, clear: float) -> None:
-        """Take the next frame in; a change above ``clear`` is no noise."""
+    def add(self, now_s: float, given: Floats, usable: Flags, noise: float) -> None:
+        """Take the next frame in; ``noise`` is that of the typical taxel."""
+        self._sum += np.where(usable, given, np.float32(np.nan))
+        self._frames += 1
         if now_s - self._before_s < _CHANGE_S:
             return
-        change = given - self._before
-        self._before, self._before_s = np.where(usable, given, np.nan).astype(np.float32), now_s
-        change[np.isnan(change)] = 0
+        mean, clear = self._sum / np.float32(self._frames), _CLEAR_CHANGE * noise * math.sqrt(2 / self._frames)
+        change = np.nan_to_num(mean - self._before)
+        self._before, self._before_s, self._frames = mean, now_s, 0
+        self._sum[:] = 0
+        self._compare(now_s, change, clear)
+
+    def _compare(self, now_s: float, change: Floats, clear: float) -> None:
+        """Take in changes, of which one above ``clear`` is no noise."""
         size = np.abs(change)
         felt = np.flatnonzero(size > clear)[:_MOST_COMPARED]
-        if not len(felt):
+        is_in_use = np.zeros(int(self._module.max(initial=-1)) + 1, bool)
+        is_in_use[self._module[felt]] = True
+        rows = np.flatnonzero(is_in_use[self._module] & self._is_known)[:_MOST_COMPARED]
+        if not len(rows):
             return
-        is_alone = self._is_known[felt] & (_most_around(self._table, felt, size) <= _STEADY * size[felt])
-        for taxel in felt[is_alone].tolist():
-            others = felt[(self._module[felt] == self._module[taxel]) & (felt != taxel)]
-            if taxel in self._alone or not (size[others] >= _BELOW * size[taxel]).any():
-                continue
-            if len(self._alone) == _MOST_ALONE:
-                del self._alone[min(self._alone, key=lambda one: self._alone[one].touches)]
-            members = np.flatnonzero(self._module == self._module[taxel])
-            self._alone[taxel] = _Alone(members[~np.isin(members, [taxel, *self._table[taxel]])])
-        modules = set(self._module[felt].tolist())
-        watched = np.array([one for one in self._alone if int(self._module[one]) in modules], np.int64)
-        steady = _most_around(self._table, watched, size) <= np.maximum(_STEADY * size[watched], clear / 2)
-        for taxel in watched[steady & usable[watched]].tolist():
-            self._alone[taxel].add(now_s, float(change[taxel]), change, clear)
+        around = np.where(self._table[rows] == NONE, np.float32(np.nan), change[self._table[rows]])
+        own = change[rows] - lower_median(around)[0]
+        sign, far = np.sign(own), _STEADY * np.abs(own)
+        is_alone = np.nanmax(sign[:, None] * around, axis=1) <= np.maximum(far, clear / 2)
+        is_alone &= (sign * change[rows] >= far) | (np.abs(own) <= clear)  # a dead taxel does not sag
+        for taxel, moved in zip(rows[is_alone].tolist(), own[is_alone].tolist(), strict=True):
+            if taxel not in self._alone and abs(moved) > clear:
+                self._watch(taxel, felt[size[felt] >= _BELOW * abs(moved)])
+            if taxel in self._alone:
+                self._alone[taxel].add(now_s, moved, change, clear)
+
+    def _watch(self, taxel: int, felt: Whole) -> None:
+        """Compare a taxel from now on, if others of its module were touched as well."""
+        members = np.flatnonzero(self._module == self._module[taxel])
+        others = members[~np.isin(members, [taxel, *self._table[taxel]])]
+        if not np.isin(others, felt).any():
+            return
+        if len(self._alone) == _MOST_ALONE:
+            del self._alone[min(self._alone, key=lambda one: self._alone[one].touches)]
+        self._alone[taxel] = _Alone(others)
 
     def found(self, share: float, alike: float, touches: int) -> tuple[Whole, Whole, Doubles]:
         """Find taxels that show a part of the touches of others: (m,) they, (m,) those others, and (m,) the part.

@@ -1,6 +1,6 @@
 """Judge all sensors of a driver; publish and read it: the service ``health``, once a second, with the reasons.
 
-Columns of a sample: those of :data:`skinware.tactile.health_report.COLUMNS`, of all sensors of the driver in the order
+Columns of a sample: those of :data:`skinware.tactile.health.COLUMNS`, of all sensors of the driver in the order
 of its frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns:
 ``sensor_uid``, ``sensor_type``, and the name of the ``driver``.
 """
@@ -17,8 +17,7 @@ from skinware.errors import ConfigurationError
 from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Flags, rows_of
 from skinware.tactile.chain import HEALTH, BaselineStage, Chain, ChainState
-from skinware.tactile.health import Health
-from skinware.tactile.health_report import COLUMNS, NOTHING, HealthReport
+from skinware.tactile.health import COLUMNS, NOTHING, Health, HealthReport
 from skinware.tactile.source_service import (
     ServiceForm,
     ServiceOptions,

@@ -19,7 +19,7 @@ from skinware.state import count_statuses, state_name
 from skinware.status import BusReason, BusState, PatchState, Status, load_report
 from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import ChainHealth
 from skinware_drivers.doctor.evidence import (
     BusSeen,

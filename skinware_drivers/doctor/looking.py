@@ -29,7 +29,7 @@ from skinware.realtime import now_ns
 from skinware.service import ServiceReader
 from skinware.state import life_of, rate_now_hz, status_now
 from skinware.status import Status
-from skinware.tactile.health_report import HealthKind
+from skinware.tactile.health import HealthKind
 from skinware.tactile.health_service import HealthReader
 from skinware.views.live import LiveBridges
 from skinware_drivers.doctor.driver_log import DriverLog, taxel_faults

@@ -14,7 +14,7 @@ import pytest
 from skinware import DriverReader, Namespace, ServiceWriter, Status
 from skinware.cli._command import exit_status
 from skinware.cli.info import command
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import HealthWriter
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure

@@ -20,7 +20,7 @@ from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState, save_state
 from skinware.tactile.contacts_service import ContactsReader
 from skinware.tactile.derived_services import CalmHealth
-from skinware.tactile.health_report import COLUMNS, NOTHING, HealthKind, HealthReport
+from skinware.tactile.health import COLUMNS, NOTHING, HealthKind, HealthReport
 from skinware.tactile.health_service import HealthReader, HealthWriter
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.tactile.test_calm_contacts import calming, press

@@ -10,8 +10,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.health import Health, HealthSettings
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import Health, HealthKind, HealthReport, HealthSettings
 from skinware.tactile.testing import Response, World, grid
 from tests.tactile.bench import BENCH_S
 from tests.tactile.judging import Worlds

@@ -7,8 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.health import Health
-from skinware.tactile.health_report import HealthKind, HealthReport
+from skinware.tactile.health import Health, HealthKind, HealthReport
 from skinware.tactile.testing import grid
 from tests.tactile.skins import placed
 

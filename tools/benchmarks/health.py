@@ -10,8 +10,7 @@ import numpy.typing as npt
 from contacts import FRAMES, MODULE, PATCH, PERIOD_NS, TAXELS, figures
 
 from skinware.tactile.baseline import Baseline
-from skinware.tactile.health import Health
-from skinware.tactile.health_report import HealthKind
+from skinware.tactile.health import Health, HealthKind
 from tests.tactile.skins import placed, triangles
 from tests.tactile.test_health import PLATES, QUICK, chosen, judged, plates
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -20,7 +20,7 @@ from skinware.tactile.contacts_service import ContactsReader, ContactsSample
 from skinware.tactile.motion import MotionReader, MotionSample
 from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
-from skinware.views.live import LiveDriver, LiveDrivers, LiveSources
+from skinware.views.live import EverySnapshot, LiveDriver, LiveDrivers, LiveSources
 from skinware.views.quantities import WITHOUT_VALUE, Quantity, physical_values, quantities_of
 from skinware.views.robot import Robot
 from skinware.views.scene import Scene
@@ -41,6 +41,7 @@ class Newest:
     Attributes:
         status: (n_sensors,) uint8, status of its sensors now, with the health that the calmed driver publishes.
         calm: snapshot of the calmed driver, if it lives and has the same sensors.
+        all: snapshots since the last one that was newest, of the calmed driver where there is one; the newest last.
         contacts, motion: on the driver; None where no service publishes them.
         shared: results that several viewers need, by a key of their own.
     """
@@ -50,6 +51,7 @@ class Newest:
     calm: DriverSnapshot | None
     contacts: ContactsSample | None
     motion: MotionSample | None
+    all: Sequence[DriverSnapshot]
     shared: dict[object, Any] = field(default_factory=dict)
 
     def once(self, key: object, make: Callable[[], _Made]) -> _Made:
@@ -94,8 +96,17 @@ class Newest:
             "marked", lambda: np.where(self.settling & ((self.status & _NEVER_SEEN) != 0), _ALL_BITS, self.status)
         )
 
+    def highest_change(self, quantity: Quantity, rest: npt.NDArray[np.float32]) -> npt.NDArray[np.floating[Any]]:
+        """Return (n,) the greatest distance of fresh values from ``rest``, or above baselines, in all snapshots."""
+        changes = np.stack([frame.physical(quantity.type.name) for frame in self.all])
+        if self.calm is None:
+            changes -= rest[quantity.where]
+        fresh = np.stack([frame.status[quantity.where] for frame in self.all]) == 0
+        highest: npt.NDArray[np.floating[Any]] = np.where(fresh, np.nan_to_num(np.abs(changes)), 0).max(axis=0)
+        return highest
+
     def totals(self, quantity: Quantity, rest: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float64] | None:
-        """Return (n_pads,) the load on each pad, the sum or the highest of its values, in the quantity's unit.
+        """Return (k, n_pads) the load on each pad in each of ``all``, the sum or the highest of its values.
 
         Args:
             rest: (n_sensors,) values at rest that are taken off; None: none are.
@@ -103,20 +114,13 @@ class Newest:
         Returns:
             None where values are no loads: counts, but on a hand or beside a calmed driver, and other quantities.
         """
-        loads = self.above_baseline(quantity)
-        if loads is None:
-            if not quantity.has_loads:
-                return None
-            loads = self.physical(quantity)
-            loads = loads if rest is None else loads - rest[quantity.where]
-        loads = np.where((self.status[quantity.where] & WITHOUT_VALUE) == 0, np.nan_to_num(loads), 0)
-        pads = quantity.pads
-        pad = pads.of_sensor[quantity.where]
-        if quantity.total != "highest":
-            return np.bincount(pad, loads, len(pads.names)).astype(np.float64)
-        highest = np.zeros(len(pads.names))
-        np.maximum.at(highest, pad, loads)
-        return highest
+        if self.calm is None and not quantity.has_loads:
+            return None
+        loads = np.stack([frame.physical(quantity.type.name) for frame in self.all])
+        if self.calm is None and rest is not None:
+            loads -= rest[quantity.where]
+        without = np.stack([frame.status[quantity.where] for frame in self.all]) & WITHOUT_VALUE
+        return quantity.totals(np.where(without == 0, np.nan_to_num(loads), 0))
 
 
 class Origin:
@@ -232,6 +236,8 @@ class ShownDriver:
         self.taken_ns = self._judged_ns = 0
         self._calm_pair: tuple[Structure | None, Structure | None, bool] = (None, None, False)
         self.newest: Newest | None = None
+        self._every = EverySnapshot(origin.namespace, live.name)
+        self._every_calm = EverySnapshot(origin.calm or origin.namespace, live.name)
         self.structure, self.generation = live.structure, live.reader.generation
         self.quantities = quantities_of(self.structure)
         self.past, self.rest = RecentValues(self.structure.n_sensors, self.structure.dtype), DriverRest(self.structure)
@@ -276,7 +282,7 @@ class ShownDriver:
         self.taken_ns, self.life = now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
         at_ns = None if self.origin.recording is None else frame.published_ns  # it may have been paused meanwhile
-        self.newest = self._judged(frame, status_now(LIVE, frame, at_ns))
+        self.newest = self._judged(frame, status_now(LIVE, frame, at_ns), is_newer=True)
         self.rest.follow(self.newest.all_physical(), self.newest.status == 0, frame.published_ns)
         self.changes += 1
 
@@ -296,14 +302,19 @@ class ShownDriver:
         ):
             self.changes += 1
 
-    def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8]) -> Newest:
+    def close(self) -> None:
+        self._every.close()
+        self._every_calm.close()
+
+    def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8], *, is_newer: bool = False) -> Newest:
         self._judged_ns = now_ns()
         calm, contacts, motion = self.origin.about(self.live.name)
         if calm is not None and not self._fits(calm.structure):
             calm = None
         if calm is not None:
             status = status | (calm.status & _UNHEALTHY)
-        return Newest(frame, status, calm, contacts, motion)
+        every, last = (self._every, frame) if calm is None else (self._every_calm, calm)
+        return Newest(frame, status, calm, contacts, motion, every.until(last) if is_newer else [last])
 
     def _fits(self, calm: Structure) -> bool:
         """Return whether a calmed driver has the same sensors; the comparison is made once for two structures."""
@@ -355,10 +366,13 @@ class Follower:
             return []
         if [driver.live for driver in self.drivers] != [live for live, _ in found]:
             kept = {id(driver.live): driver for driver in self.drivers}
-            self.drivers = []
+            gone, self.drivers = self.drivers, []
             for live, origin in found:
                 number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
                 self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
+            for driver in gone:
+                if driver not in self.drivers:
+                    driver.close()
             self._arrange()
         generations = [driver.generation for driver in self.drivers]
         newer = [driver for driver in self.drivers if self._take(driver, period_ns)]
@@ -367,6 +381,8 @@ class Follower:
         return newer
 
     def close(self) -> None:
+        for driver in self.drivers:
+            driver.close()
         for origin in self.origins:
             origin.close()
         self.drivers = []

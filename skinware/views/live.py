@@ -16,7 +16,15 @@ from skinware.bridge_state import BridgeReader, BridgeState
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.drivers import Drivers
-from skinware.errors import ConfigurationError, NamespaceError, ServiceNotFound, ServiceTimeout, StructureError
+from skinware.errors import (
+    ConfigurationError,
+    NamespaceError,
+    Overrun,
+    ServiceError,
+    ServiceNotFound,
+    ServiceTimeout,
+    StructureError,
+)
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import SampleT
 from skinware.realtime import NS_PER_S
@@ -31,6 +39,7 @@ _RATE_WINDOW_NS = 2 * NS_PER_S
 _COUNT_EVERY_NS = NS_PER_S // 10
 _WAIT_S = 0.1
 _SILENT_S = 5.0
+_MOST_BETWEEN = 64
 
 
 class _Count(NamedTuple):
@@ -97,6 +106,35 @@ class LiveDriver:
         """Return the time between the first and the last count, s; 0 if it is too short to measure a rate."""
         passed_ns = self._counts[-1].time_ns - self._counts[0].time_ns if self._counts else 0
         return passed_ns / NS_PER_S if passed_ns >= _RATE_WINDOW_NS // 4 else 0.0
+
+
+class EverySnapshot:
+    """The snapshots of a driver between two that are shown, for what no picture may miss."""
+
+    def __init__(self, namespace: Namespace, name: str) -> None:
+        self._namespace, self._name = namespace, name
+        self._reader: DriverReader | None = None
+
+    def until(self, newest: DriverSnapshot) -> list[DriverSnapshot]:
+        """Return those since the last call, ``newest`` last; only those that the ring still has, of one structure."""
+        found: deque[DriverSnapshot] = deque(maxlen=_MOST_BETWEEN)
+        try:
+            if self._reader is None:
+                self._reader = DriverReader(self._name, namespace=self._namespace, announce=False)
+            for snapshot in self._reader.in_order(timeout_s=0.0):
+                if snapshot.position >= newest.position:
+                    break
+                found.append(snapshot)
+        except (ServiceTimeout, Overrun):
+            pass
+        except ServiceError:
+            self.close()
+        return [*(snapshot for snapshot in found if snapshot.generation == newest.generation), newest]
+
+    def close(self) -> None:
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
 
 
 class LiveDrivers:

@@ -121,7 +121,7 @@ class QuantityPicture(NamedTuple):
     longest_shear: float
     """The shear that 127 means."""
     totals: npt.NDArray[np.float64] | None
-    """(n_pads,) see :meth:`skinware.views.following.Newest.totals`."""
+    """(k, n_pads) see :meth:`skinware.views.following.Newest.totals`."""
 
 
 class Look:
@@ -173,9 +173,7 @@ class Look:
         if memory.rest is not driver.rest:
             memory.rest.follow(values, fresh, newest.frame.published_ns)
         if self.mode == "peak":
-            change = newest.above_baseline(quantity)
-            change = memory.rest.change(values)[quantity.where] if change is None else np.abs(change)
-            change = np.where(fresh[quantity.where], change, 0)
+            change = newest.highest_change(quantity, memory.rest.baseline)
             memory.peak = quantity.name, np.fmax(_peaks(memory, quantity), change).astype(np.float32)
         if self.mode == "wipe" and self._wiping:
             if memory.wipe is None:

@@ -97,6 +97,23 @@ class Quantity:
         is_count = not self.type.unit.endswith(("N", "Pa"))
         return self.total is not None and (not is_count or bool(self.pads.is_on_hand[self.where].all()))
 
+    def totals(self, loads: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
+        """Return (k, n_pads) the load on each pad from (k, n) loads of its taxels, 0 or more where there are none."""
+        order, starts, pads = self._by_pad
+        found = np.zeros((len(loads), len(self.pads.names)))
+        if len(starts):
+            reduce = np.maximum.reduceat if self.total == "highest" else np.add.reduceat
+            found[:, pads] = reduce(loads[:, order].astype(np.float64), starts, axis=1)
+        return found
+
+    @cached_property
+    def _by_pad(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """The order of taxels by pad, where each pad begins in it, and the pads."""
+        pad = self.pads.of_sensor[self.where]
+        order = np.argsort(pad, kind="stable")
+        pads, starts = np.unique(pad[order], return_index=True)
+        return order, starts, pads
+
     @cached_property
     def pitch_m(self) -> float:
         """The usual distance from a taxel to the nearest other, m; NaN where places are not known."""

@@ -217,7 +217,9 @@ class Viewer:
         if picture.shear is not None:
             shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
         if picture.totals is not None:
-            shown["totals"] = blobs.add(picture.totals, "<f4")
+            shown["totals"] = blobs.add(picture.totals[-1], "<f4")
+            if len(picture.totals) > 1:
+                shown["between"] = blobs.add(picture.totals[:-1], "<f4")
         status, key = newest.marked[quantity.where], (driver.number, quantity.name)
         before = self._status.get(key)
         if before is None or not np.array_equal(status, before):

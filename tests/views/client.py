@@ -46,7 +46,7 @@ class Turn:
         """Of a driver, with its arrays; None where there is none in this turn."""
         for told in self.header.get("pictures", ()):
             if told["driver"] == driver:
-                arrays = {"levels": "B", "status": "B", "shear": "b", "totals": "f"}
+                arrays = {"levels": "B", "status": "B", "shear": "b", "totals": "f", "between": "f"}
                 found = {name: self.array(told[name], code) for name, code in arrays.items() if name in told}
                 if "shear" in found:
                     found["shear"] = found["shear"].reshape(-1, 2)

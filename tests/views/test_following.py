@@ -11,6 +11,7 @@ from skinware import DriverReader, Namespace, Status
 from skinware.errors import ServiceNotFound
 from skinware.status import Why
 from skinware.views.following import Follower, Origin
+from skinware.views.looks import Choose, Look, QuantityPicture
 from skinware.views.tree import problems_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
@@ -36,6 +37,43 @@ def test_each_frame_is_taken_once(namespace: Namespace) -> None:
         skin.publish(3)
         assert names(follower) == ["b"]
         assert follower.drivers[1].changes == before + 1
+
+
+@pytest.mark.parametrize("is_calmed", [False, True], ids=["raw", "calmed"])
+def test_a_press_between_two_pictures_is_a_peak(
+    namespace: Namespace, calm_namespace: Namespace, is_calmed: bool
+) -> None:
+    structure = fake_structure(1, 2)
+    with (
+        FakeSkin("a", structure) as raw,
+        FakeSkin("a", structure, calm_namespace) as calm,
+        closing(Follower(Origin(namespace, calm=calm_namespace if is_calmed else None))) as follower,
+    ):
+        skin = calm if is_calmed else raw
+        skin.values = np.full(24, 255)  # 0 counts
+        look = Look()
+        look.choose(Choose(mode="peak"))
+
+        def shown(*loads: tuple[int, int]) -> QuantityPicture:
+            for positions in [*loads, None]:
+                skin.values = np.full(24, 255)
+                if positions is not None:
+                    skin.values[list(positions)] = 155
+                raw.publish()
+                calm.publish()
+            (driver,) = follower.take(0)
+            look.follow(driver)
+            picture = look.picture(driver)
+            assert picture is not None
+            return picture
+
+        assert not shown().levels.any()
+        picture = shown((3, 4), (4, 15))
+        assert np.flatnonzero(picture.levels).tolist() == [3, 4, 13]  # of pressure
+        if is_calmed:  # counts of a patch are a load only above baselines
+            assert picture.totals is not None
+            assert picture.totals.tolist() == [[200, 0], [100, 100], [0, 0]]
+        assert np.flatnonzero(shown().levels).tolist() == [3, 4, 13]  # of pressure
 
 
 def test_a_calmed_driver_settles_and_its_reasons_are_problems(namespace: Namespace) -> None:

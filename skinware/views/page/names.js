@@ -33,10 +33,14 @@ class Part {
 
   /** Sum or highest of its loads; null where they are not known. */
   get total() {
-    const { shown, total } = this.sheet;
-    const totals = shown.totals && this.modules.map((module) => shown.totals[module]);
+    return this.#totalOf(this.sheet.shown.totals);
+  }
+
+  /** @param {?Float32Array} loads of all modules; @param {number} from the first of them. */
+  #totalOf(loads, from = 0) {
+    const totals = loads && this.modules.map((module) => loads[from + module]);
     if (!totals) return null;
-    return total === "highest" ? Math.max(...totals) : totals.reduce((sum, load) => sum + load, 0);
+    return this.sheet.total === "highest" ? Math.max(...totals) : totals.reduce((sum, load) => sum + load, 0);
   }
 
   /** The load that its name has: now, or in the mode of peaks the most so far. */
@@ -44,8 +48,13 @@ class Part {
     return this.sheet.shown.mode === "peak" ? this.peak : this.total;
   }
 
+  /** Keep the most, also of the snapshots between two pictures. */
   hold() {
+    const { between, driver } = this.sheet;
     if (this.total !== null) this.peak = Math.max(this.peak ?? -Infinity, this.total);
+    for (let from = 0; from < (between?.length ?? 0); from += driver.modules.length) {
+      this.peak = Math.max(this.peak ?? -Infinity, this.#totalOf(between, from));
+    }
   }
 
   isAway(eye) {

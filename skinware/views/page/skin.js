@@ -29,6 +29,7 @@ class Sheet {
     this.levels = new Uint8Array(this.n).fill(NOTHING);
     this.shear = null;
     this.totals = null; // by module
+    this.between = null; // the same of each snapshot since the picture before
     this.contacts = [];
     this.regions = [];
     this.scale = [0, 1];
@@ -62,6 +63,7 @@ class Sheet {
     if (picture.status) this.status = blob(picture.status, Uint8Array);
     this.shear = picture.shear ? blob(picture.shear, Int8Array) : null;
     this.totals = picture.totals ? blob(picture.totals, Float32Array) : null;
+    this.between = picture.between ? blob(picture.between, Float32Array) : null;
     this.contacts = (picture.contacts ?? []).map((contact) => ({ ...contact, at: this.#placeOf(contact) }));
     this.regions = picture.regions ?? [];
     this.scale = picture.scale ?? this.scale;

@@ -8,6 +8,7 @@ import signal
 import time
 from typing import ClassVar
 
+import numpy as np
 from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
@@ -20,17 +21,20 @@ from skinware.cli._painting import MARK_CHARACTERS, MARK_NAMES, HeatMap, Palette
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
 from skinware.cli._top_list import DriverList
 from skinware.cli._top_rows import COLUMNS, ListRow, labels_of, lines_of, rows_of
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import NamespaceError
+from skinware.memory.futex import Word, sleep_on
 from skinware.memory.namespace import Namespace
+from skinware.realtime import NS_PER_S, now_ns
 from skinware.state import LIVE, life_of
 from skinware.tactile.regions import Regions
-from skinware.text import counters_text, plural, printable
+from skinware.text import age_text, counters_text, plural, printable
 from skinware.views.live import LiveDriver, Overview
 
 _REDRAWS_HZ = 12
-_SHARE, _LONGEST_REST_S = 0.045, 0.5
+_SHARE, _LONGEST_REST_S = 0.035, 0.5
 """Part of a core that the program may use, and for how long at most pictures wait for that."""
-_LIST_PERIOD_S = 1.0
+_LIST_PERIOD_S, _LONGEST_SLEEP_NS = 1.0, 10 * NS_PER_S
 _MOST_CONTACTS = 9
 """Lines of contacts, where there is room."""
 _LOW = 20
@@ -176,7 +180,11 @@ class SkinTop(App[None]):
         self._lines = {name: Static(id=name, markup=False) for name in _LINES}
         self._is_worst_first = True
         self._pointed: int | None = None
-        self._must_draw = True
+        self._bell = np.zeros(1, np.uint32)
+        self._bell_word = Word(self._bell.view(np.uint8), 0)
+        self._asked, self._must_draw = asyncio.Event(), True
+        self._drawn: DriverSnapshot | None = None
+        self._listed: tuple[object, ...] = ()
         self._drawn_s = self._used_s = 0.0
 
     def get_default_screen(self) -> Screen[None]:
@@ -205,13 +213,15 @@ class SkinTop(App[None]):
                 loop.add_signal_handler(number, self.exit)
         self._update_list()
         self.set_interval(_LIST_PERIOD_S, self._update_list)
-        self.set_interval(1 / _REDRAWS_HZ, self._update_picture)
+        self._following = asyncio.create_task(self._follow())
         if self._duration_s is not None:
             self.set_timer(self._duration_s, self.exit)
 
     def on_unmount(self) -> None:
         for number in _ENDING_SIGNALS:
             asyncio.get_running_loop().remove_signal_handler(number)
+        self._following.cancel()
+        self._draw_soon()  # which ends its wait
         self._overview.close()
 
     def action_choose(self, step: int) -> None:
@@ -232,33 +242,54 @@ class SkinTop(App[None]):
         driver = self._driver_of(row) if row else None
         if driver is not None:
             self._picture.next_type(driver.reader.structure)
-            self._must_draw = True
+            self._draw_soon()
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:  # noqa: ARG002 - Textual's
         return self._picture.regions is not None or action != "next_region"
 
     def action_next_scale(self) -> None:
         self._picture.next_scale()
-        self._must_draw = True
+        self._draw_soon()
 
     def action_next_region(self) -> None:
         self._picture.next_region()
-        self._must_draw = True
+        self._draw_soon()
 
     def action_take_baselines(self) -> None:
         self._picture.take_baselines()
-        self._must_draw = True
+        self._draw_soon()
 
     def on_driver_list_row_chosen(self) -> None:
         self._pointed = None
-        self._must_draw = True
+        self._draw_soon()
 
     def on_heat_map_pointed(self, event: HeatMap.Pointed) -> None:
         self._pointed = event.sensor
-        self._must_draw = True
+        self._draw_soon()
 
     def on_resize(self) -> None:
-        self._must_draw = True  # the next layout changes the space for the picture
+        self._draw_soon()  # the next layout changes the space for the picture
+
+    def _draw_soon(self) -> None:
+        self._must_draw = True
+        self._asked.set()
+        self._bell += 1
+        self._bell_word.wake_all()
+
+    async def _follow(self) -> None:
+        """Draw the picture whenever the chosen driver publishes, or something asks for it; else sleep."""
+        while True:
+            driver = self._driver_of(self._list.chosen) if self._list.chosen else None
+            words = [(self._bell_word, int(self._bell[0]))]
+            words += [] if driver is None else [driver.wake_word]
+            self._asked.clear()
+            self._update_picture()
+            await asyncio.to_thread(sleep_on, words, now_ns() + _LONGEST_SLEEP_NS)
+            await asyncio.sleep(1 / _REDRAWS_HZ)
+            used_s = time.process_time() - self._used_s
+            rest_s = self._drawn_s + min(used_s / _SHARE, _LONGEST_REST_S) - time.monotonic()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._asked.wait(), max(0.0, rest_s))
 
     def _driver_of(self, row: ListRow) -> LiveDriver | None:
         return self._overview.drivers.get(row.key.driver)
@@ -278,6 +309,10 @@ class SkinTop(App[None]):
         heading = ["skin-top", f"namespace {namespace}"]
         try:
             drivers = self._overview.look()
+            state = (self._is_worst_first, self.size, self._list.scroll_offset, *map(_state_of, drivers))
+            if state == self._listed and not self._overview.bridges.readers:
+                return
+            self._listed = state
             reports = [driver.report() for driver in drivers]
             if self._is_worst_first:
                 reports.sort(key=lambda report: -report.worst)
@@ -285,13 +320,15 @@ class SkinTop(App[None]):
             heading += [plural(len(drivers), "driver")]
             heading += [summary(bridge.robot, as_data(bridge)) for bridge in self._overview.bridges.states()]
         except NamespaceError as error:
-            why = str(error)
+            why, self._listed = str(error), ()
         self._say("why", why)
         self.query("#nothing").set(display=not rows)
         self.query("#all").set(display=bool(rows))
+        before = self._list.chosen and self._list.chosen.ageless()
         self._list.show(rows)
         self._say("head", "   ".join([*heading, *self._hidden_rows()]))
-        self._must_draw = True  # counters and ages change without a snapshot
+        if before != (self._list.chosen and self._list.chosen.ageless()):
+            self._draw_soon()
 
     def _hidden_rows(self) -> list[str]:
         """Return how many rows of the list are above and below those that are seen."""
@@ -307,14 +344,12 @@ class SkinTop(App[None]):
         driver = self._driver_of(row) if row else None
         if row is None or driver is None or not size.area or not self._lines["detail"].is_attached:
             return
-        now_s, used_s = time.monotonic(), time.process_time()
-        if not self._must_draw and now_s - self._drawn_s < min((used_s - self._used_s) / _SHARE, _LONGEST_REST_S):
-            return
-        is_newer = self._overview.drivers.poll(driver)
+        self._overview.drivers.poll(driver)
         frame, picture = driver.frame, self._picture
+        is_newer, self._drawn = frame is not self._drawn, frame
         if frame is None or not (is_newer or self._must_draw):
             return
-        self._must_draw, self._drawn_s, self._used_s = False, now_s, used_s
+        self._must_draw, self._drawn_s, self._used_s = False, time.monotonic(), time.process_time()
         picture.draw(row.key, frame, size.width, size.height, LIVE if is_newer else life_of(driver.reader, frame))
         self._show_contacts(driver)
         hidden = 0 if picture.arrangement is None else picture.arrangement.lines - size.height
@@ -337,6 +372,12 @@ class SkinTop(App[None]):
         arrangement = self._picture.arrangement
         if arrangement is not None:
             self._heat_map.show(arrangement, self._picture.pixels, labels_of(places, arrangement))
+
+
+def _state_of(driver: LiveDriver) -> tuple[object, ...]:
+    """Return what rows of a driver are made of; no age of a part changes before that of the driver."""
+    frame = driver.frame
+    return driver.name, life_of(driver.reader, frame), frame, None if frame is None else age_text(frame.age_ns)
 
 
 def _printable(text: str | Text) -> str | Text:

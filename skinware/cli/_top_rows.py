@@ -27,6 +27,7 @@ from skinware.views.live import TouchedPlace
 
 COLUMNS = ("driver, bus, patch", "state", "rate", "age", "fresh", "dropped", "orphans", "other counters")
 """Titles of the cells of a row."""
+_AGE = COLUMNS.index("age")
 
 _NOT_AMONG_OTHERS = ("dropped", "orphans", "bytes_in", "frame_bytes", "idle_bytes")
 """Counters with a column of their own, and counters that grow while all is well: the chosen row shows them."""
@@ -54,6 +55,10 @@ class ListRow(NamedTuple):
     """All its sensors are fresh."""
     counters: dict[str, int]
     """Every counter that the driver publishes for this row, by name."""
+
+    def ageless(self) -> ListRow:
+        """Return the row without the age, which changes without news."""
+        return self._replace(cells=self.cells[:_AGE] + self.cells[_AGE + 1 :])
 
 
 def rows_of(report: DriverReport, *, worst_first: bool = True) -> list[ListRow]:

@@ -25,9 +25,11 @@ from skinware.errors import (
     ServiceTimeout,
     StructureError,
 )
+from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import SampleT
 from skinware.realtime import NS_PER_S
+from skinware.service._reader import wake_word_of
 from skinware.skin import Skin
 from skinware.state import DriverReport, report_of
 from skinware.structure import Structure
@@ -64,6 +66,11 @@ class LiveDriver:
     def structure(self) -> Structure:
         """The structure of its newest snapshot, before the first that of the service."""
         return self.reader.structure if self.frame is None else self.frame.structure
+
+    @property
+    def wake_word(self) -> tuple[Word, int]:
+        """The futex that every snapshot wakes, and its present value; take it before looking for a newer one."""
+        return wake_word_of(self.reader)
 
     @property
     def rate_hz(self) -> float | None:

@@ -1,7 +1,8 @@
 """Convert the stamps of a device's own clock to CLOCK_MONOTONIC: when a sample was taken, not when its frame came.
 
-A frame is received some time after it was stamped, never before. The shortest delay varies little, while USB and busy
-computers add milliseconds to many frames and half a second to a few. So the line that lies under all points (stamp,
+The device may also be the controller of a CAN interface, whose frames are received when the kernel stamps them. A frame
+is received some time after it was stamped, never before. The shortest delay varies little, while USB and busy computers
+add milliseconds to many frames and half a second to a few. So the line that lies under all points (stamp,
 time of receipt), and as close to them as possible, gives the rate of the device's clock, and its offset up to the
 shortest delay (S. B. Moon, P. Skelly, D. Towsley, "Estimation and Removal of Clock Skew from Network Delay
 Measurements", 1999). Late frames do not move it.
@@ -22,8 +23,6 @@ from skinware.realtime import NS_PER_S
 Times = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.floating[Any]]
 
-_PART_NS = NS_PER_S
-"""One point is kept for each part of the window of this length: the one with the least delay."""
 _WINDOW_PARTS = 60
 """A shorter window follows changes of temperature faster, a longer one is steadier."""
 _MOST_DRIFT = 500e-6
@@ -31,10 +30,8 @@ _MOST_DRIFT = 500e-6
 _RECENT_PARTS = 10
 """The offset is the least delay of the last parts in which frames came, so that delayed frames are known as late, also
 after a pause."""
-_LEAST_SPAN_NS = 2 * NS_PER_S
+_LEAST_SPAN_PARTS = 2
 """Before points span this time, the device's clock is assumed to run like CLOCK_MONOTONIC."""
-_JUMP_NS = NS_PER_S / 20
-"""A stamp so far in the future shows that the device's clock was set."""
 _FAR_BEHIND_NS = NS_PER_S
 """If all stamps of a part lie further in the past, the device's clock stands still: after a delay of the line or of
 this machine, frames without delay follow at once."""
@@ -53,6 +50,8 @@ class DeviceClock:
     Args:
         unit_s: seconds per count.
         modulo: the stamps wrap to 0 here.
+        part_ns: one point is kept for each part of the window of this length: the one with the least delay.
+        jump_ns: a stamp so far in the future shows that the device's clock was set.
 
     Attributes:
         restarts: how often the device's clock restarted.
@@ -60,9 +59,11 @@ class DeviceClock:
         repeated: stamps equal to the one before.
     """
 
-    def __init__(self, unit_s: float, modulo: int = 1 << 32) -> None:
+    def __init__(
+        self, unit_s: float, modulo: int = 1 << 32, *, part_ns: int = NS_PER_S, jump_ns: int = NS_PER_S // 20
+    ) -> None:
         self._unit_ns = unit_s * NS_PER_S
-        self._modulo = modulo
+        self._modulo, self._part_ns, self._jump_ns = modulo, part_ns, jump_ns
         self._points: deque[tuple[int, float, float]] = deque(maxlen=_WINDOW_PARTS)
         self._origin_ns = 0
         self._ticks = 0
@@ -136,7 +137,7 @@ class DeviceClock:
         ticks = self._ticks + np.cumsum(step[start:stop])
         device_ns: Floats = ticks * self._unit_ns
         delay_ns: Floats = (received[start:stop] - self._origin_ns) - device_ns
-        future = np.flatnonzero(delay_ns - self._line(device_ns) < -_JUMP_NS)
+        future = np.flatnonzero(delay_ns - self._line(device_ns) < -self._jump_ns)
         if len(future):
             stop = start + int(future[0])
             device_ns, delay_ns = device_ns[: int(future[0])], delay_ns[: int(future[0])]
@@ -154,7 +155,7 @@ class DeviceClock:
     def _learn(self, received: Times, device_ns: Floats, delay_ns: Floats) -> None:
         """Keep the points of least delay, and fit the line under them."""
         above = delay_ns - self._slope * device_ns
-        parts = received // _PART_NS
+        parts = received // self._part_ns
         edges = np.flatnonzero(np.diff(parts, prepend=parts[:1] - 1))
         for start, stop in zip(edges.tolist(), [*edges[1:].tolist(), len(parts)], strict=True):
             best = start + int(np.argmin(above[start:stop]))
@@ -170,7 +171,7 @@ class DeviceClock:
 
     def _fit_slope(self) -> None:
         whole = list(self._points)[:-1]  # the best point of the newest part may be yet to come
-        if len(whole) < 2 or whole[-1][1] - whole[0][1] < _LEAST_SPAN_NS:
+        if len(whole) < 2 or whole[-1][1] - whole[0][1] < _LEAST_SPAN_PARTS * self._part_ns:
             return
         hull: list[tuple[float, float]] = []
         for _, x, y in whole:

@@ -186,6 +186,9 @@ class Flag:
         mask: any of these bits set the status of the whole module. 0: none does.
         each: (channel, bit of the word) pairs: the bit sets the status of this channel only.
         normal: the word that sets no flag: bits count as set where they differ from it.
+        each_module: (key, bit of the word) pairs, for a frame that has the status of all modules of its patch: the bit
+            sets the status of the module of this key from its next update on, until a later frame clears it, or the
+            patch restarts.
     """
 
     status: Status
@@ -194,6 +197,7 @@ class Flag:
     mask: int = 0
     each: Sequence[tuple[int, int]] = ()
     normal: int = 0
+    each_module: Sequence[tuple[int, int]] = ()
 
 
 @dataclass(frozen=True)

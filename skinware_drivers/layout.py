@@ -97,7 +97,7 @@ class Frame:
         name: for the cycle and for messages.
         when: conditions that must all hold; none: every frame of the bus with an 11-bit identifier is of this kind.
         length: correct payload lengths; frames of other lengths are counted and not shown.
-        values: the places of the values, in one run or in several.
+        values: the places of the values, in one run or in several; none: only the status of other modules is in it.
         patch: bit field of the identifier that names the patch; or the key of the only patch that sends this frame;
             None: the bus has one patch.
         module: bit field that names the module within the patch; or the key of the only module that it is of; None:
@@ -131,6 +131,11 @@ class Frame:
         if isinstance(self.values, Expand):
             return ()
         return (self.values,) if isinstance(self.values, Values) else self.values
+
+    @property
+    def module_flags(self) -> Sequence[Flag]:
+        """The flags of other modules."""
+        return [flag for flag in self.flags if isinstance(flag, Flag) and flag.each_module]
 
     @property
     def module_byte(self) -> Bits | None:
@@ -215,6 +220,11 @@ class Layout:
             raise ConfigurationError(f"a layout has 1 to {MOST_FRAMES} frames of different names, not {names}")
         for frame in self.frames:
             _check_frame(frame)
+        said = [
+            (key, flag.status) for frame in self.frames for flag in frame.module_flags for key, _ in flag.each_module
+        ]
+        if len(set(said)) < len(said):
+            raise ConfigurationError("`each_module`: one bit says whether a module has a status, and there are several")
         if len({(frame.time.unit_s, frame.time.turn) for frame in self.frames if frame.time is not None}) > 1:
             raise ConfigurationError("the times of a device's frames come from one clock: give one unit and one modulo")
         taken: set[str] = set()
@@ -230,6 +240,8 @@ class Layout:
                     f"a cycle of {len(members)} frames: in the order {cycle.order!r} give at most {most}"
                 )
             taken |= set(members)
+            if any(self.frames[names.index(name)].module_flags for name in members):
+                raise ConfigurationError(f"a cycle of {members}: a frame with `each_module` is shown by itself")
             _check_counters(cycle, [self.frames[names.index(name)] for name in members])
 
     @property
@@ -255,7 +267,7 @@ def _check_frame(frame: Frame) -> None:
 
     if not frame.length:
         raise refuse("say which payload lengths are right")
-    if not isinstance(frame.values, Expand) and not frame.runs:
+    if not isinstance(frame.values, Expand) and not frame.runs and not frame.module_flags:
         raise refuse("it has no values")
     for values in frame.runs:
         if len(values.channels) != values.count:
@@ -291,10 +303,11 @@ def _check_frame(frame: Frame) -> None:
         if isinstance(flag, Flag):
             word = np.dtype(flag.dtype)
             largest = (1 << 8 * word.itemsize) - 1
-            fits = all(0 <= shift < 8 * word.itemsize for _, shift in flag.each)
+            fits = all(0 <= shift < 8 * word.itemsize for _, shift in (*flag.each, *flag.each_module))
             if word.kind != "u" or not fits or not (0 <= flag.mask <= largest and 0 <= flag.normal <= largest):
                 raise refuse(
-                    f"a flag's `mask`, `each` and `normal` are bits of an unsigned word, not of {flag.dtype!r}: {flag}"
+                    f"a flag's `mask`, `each`, `each_module` and `normal` are bits of an unsigned word, not of"
+                    f" {flag.dtype!r}: {flag}"
                 )
     if frame.period_s is not None and not 0 < frame.period_s <= LONGEST_PERIOD_S:
         raise refuse(f"period_s = {frame.period_s}: give more than 0, at most {LONGEST_PERIOD_S:g}")

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 @cli.command(
     "skin-calm",
-    "skin-calm torso                        skin-top --namespace calm shows it",
+    "skin-calm                              the only driver; skin-top --namespace calm shows it",
     "skin-calm torso --config chain.toml    with a filter, or in N",
     "skin-calm torso --regions parts.toml   with the motion of touches over its parts",
     "skin-calm torso --into quiet           into another namespace",
 )
-@click.argument("name")
+@click.argument("name", required=False)
 @click.option(
     "--into",
     metavar="NAMESPACE",
@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 @cli.json_option
 @cli.verbose_option
 def command(
-    name: str,
+    name: str | None,
     into: str | None,
     config: Path | None,
     state_path: Path | None,
@@ -78,7 +78,7 @@ def command(
     as_json: bool,
     verbose: bool,
 ) -> None:
-    """Publish driver NAME again in another namespace, with 0 where nothing touches it, whatever drifts.
+    """Publish driver NAME, or the only one, again in another namespace, with 0 where nothing touches it.
 
     In the first seconds the untouched skin is measured. Restarts and changes of the driver do not end it. A restart of
     skin-calm itself keeps baselines for 10 minutes. Programs can call operations: tare, hold, change settings. It also
@@ -93,14 +93,16 @@ def command(
     from skinware.tactile.chain_state import default_path
     from skinware.tactile.regions import read_regions
     from skinware.text import nearest_name
+    from skinware.views.live import only_driver
     from skinware.views.robot import read_robot
 
     cli.log_to_stderr(verbose)
+    source = Namespace(namespace)
+    name = name or only_driver(source, "skin-calm NAME")
     check_name(name, "driver")
     for service_name in filter(None, (contacts, motion, health)):
         check_name(service_name, "service")
     settings = ChainSettings.calm() if config is None else ChainSettings.read(config)
-    source = Namespace(namespace)
     target = Namespace(into or source.calm_name)
     service = CalmService(
         name,

@@ -86,10 +86,10 @@ _learning_options = cli.options(
     ),
     click.option(
         "--numbers",
-        type=click.Choice(["module", "taxel"]),
+        type=click.Choice(["module", "taxel", "point"]),
         default="module",
         show_default=True,
-        help="lerobot, as state: sum and largest value of each module, or each taxel.",
+        help="lerobot, as state: sum and largest value of each module; each taxel; or place and force of each.",
     ),
     click.option(
         "--size", type=_size, default="64x64", show_default=True, metavar="WIDTHxHEIGHT", help="lerobot, as images."
@@ -107,6 +107,14 @@ _learning_options = cli.options(
         type=_range,
         metavar="LOWEST..HIGHEST",
         help="lerobot, as images: darkest and brightest value.  [default: of the sensor type]",
+    ),
+    click.option("--video", is_flag=True, help="lerobot: images as videos: small, and not exact."),
+    click.option(
+        "--resample",
+        type=click.Choice(["previous", "nearest", "linear"]),
+        default="previous",
+        show_default=True,
+        help="lerobot: the newest sample at a row, the nearest, or values between the two around it.",
     ),
     click.option(
         "--gap",
@@ -305,7 +313,7 @@ def _learning_set(
         at=options["at"],
         each_structure=options["each_structure"],
         by_marks=options["marks"],
-        **{name: options[name] for name in ("form", "numbers", "size", "colours", "value_range")},
+        **{name: options[name] for name in ("form", "numbers", "size", "colours", "value_range", "resample", "video")},
     )
     return convert_to_learning_set([file, *options["also"]], output, wanted, selection, **time_and_end)
 

@@ -85,7 +85,7 @@ def past(text: str) -> float:
 @cli.command(
     "skin-record",
     "skin-record                          everything, until Ctrl-C",
-    "skin-record torso -o walk.mcap -T 60  one driver, one minute",
+    "skin-record torso walk.mcap -T 60    one driver, one minute",
     "skin-record --split 1GB --max-size 20GB  the newest 20 GB, in files of 1 GB",
     "skin-record --last 60s               Enter, or kill -USR1, saves the last minute",
     "skin-record --wire                   also the frames on the buses, for skin-replay --wire",
@@ -131,6 +131,8 @@ def command(
 ) -> None:
     """Record drivers and services NAME..., or all of them, with all counters and states.
 
+    A NAME that ends in .mcap is the new file, as after -o.
+
     Frames that could not be recorded are counted in the file. If this command is killed, or the disk is full, all but
     the last 0.3 s is in the file, and skin-recover repairs it. If the file is deleted, moved or changed meanwhile, the
     recording ends within a second with status 1.
@@ -143,12 +145,14 @@ def command(
 
     if last_s is not None and (split_size or max_size):
         raise click.UsageError("--last keeps the past in memory: --split and --max-size are for files")
+    files = [*filter(None, [output]), *(Path(name) for name in names if name.endswith(".mcap"))]
+    if len(files) > 1:
+        raise click.UsageError(f"one file is written, and {len(files)} are given: {', '.join(map(str, files))}")
+    names = tuple(name for name in names if not name.endswith(".mcap"))
     for name in names:
-        if name.endswith(".mcap"):
-            raise click.UsageError(f"{name} is a file, and NAME a driver or service: give -o {name}")
         check_name(name, "service")
     place = Namespace(namespace)
-    path = output or Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
+    path = files[0] if files else Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
     target = _target(path, split_size, max_size, last_s)
     beside = Viewers().messages if for_viewers else None
     recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, renderer=beside)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import io
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,11 +31,7 @@ _DESCRIPTION = "recording"
 
 
 def write_npz(source: TableSource, path: Path) -> None:
-    """Write a source, in one pass for each array, which must be whole before the next one begins.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a source, in one pass for each array, which must be whole before the next one begins."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         units = []
         for table in source.tables:
@@ -72,72 +68,47 @@ _CHUNK_BYTES = 256 << 10
 """Bytes of an array that HDF5 reads at once."""
 
 
-class _GuardedFile:
+class _GuardedFile(io.FileIO):
     """A file for HDF5 that keeps errors to itself, because the library does not survive a full disk.
 
     Attributes:
         failure: the first error; nothing is written after it.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("x+b", buffering=0)
-        self._path = path
-        self.failure: OSError | None = None
+    failure: OSError | None = None
 
     def write(self, data: Any) -> int:
         rest = memoryview(data).cast("B")
         size = len(rest)
         try:
             while rest and self.failure is None:
-                rest = rest[self._file.write(rest) :]
+                rest = rest[super().write(rest) :]
         except OSError as error:
-            self.failure = OSError(error.errno, error.strerror, str(self._path))
+            self.failure = OSError(error.errno, error.strerror, self.name)
         return size
 
     def readinto(self, buffer: Any) -> int:
+        """Read, and fill up with zeros beyond the end."""
         into = memoryview(buffer).cast("B")
         into[:] = bytes(len(into))
-        self._file.readinto(into)
+        super().readinto(into)
         return len(into)
 
-    def read(self, size: int) -> bytes:
-        data = bytearray(size)
-        self.readinto(data)
-        return bytes(data)
-
-    def truncate(self, size: int) -> None:
+    def truncate(self, size: int | None = None) -> int:
         try:
-            self._file.truncate(size)
+            return super().truncate(size)
         except OSError as error:
-            self.failure = self.failure or OSError(error.errno, error.strerror, str(self._path))
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def flush(self) -> None:
-        """Do nothing: writes are not buffered."""
+            self.failure = self.failure or OSError(error.errno, error.strerror, self.name)
+            return 0
 
     def check(self) -> None:
         if self.failure is not None:
             raise self.failure
 
-    def close(self) -> None:
-        self._file.close()
-
 
 def write_hdf5(source: TableSource, path: Path) -> None:
-    """Write a source.
-
-    Raises:
-        ConfigurationError: HDF5 cannot hold the names of its arrays.
-        MissingExtra: h5py is not installed.
-        OSError: it cannot be written.
-    """
     hdf5 = package("h5py", "HDF5")
-    with contextlib.closing(_GuardedFile(path)) as stream:
+    with _GuardedFile(str(path), "x+") as stream:
         with hdf5.File(stream, "w") as file:
             units = [_write_table(file.create_group(table.name), table, stream) for table in source.tables]
             file.create_dataset(_DESCRIPTION, data=np.frombuffer(description(source, units), np.uint8))

@@ -28,7 +28,7 @@ class Format(NamedTuple):
     """A format of files or folders.
 
     Attributes:
-        write: writes a source to a path that does not exist.
+        write: writes a source to a path that does not exist; it may raise ConfigurationError, MissingExtra or OSError.
         without: returns a line for each thing of a source that the format cannot hold.
     """
 
@@ -184,21 +184,12 @@ def convert_wires(
     end_s: float | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Converted:
-    """Write the recorded wires of drivers.
+    """Write the recorded wires of drivers; the arguments and errors are those of :func:`convert`.
 
     Args:
-        path: a recording that ``skin-record --wire`` made; it is only read.
-        target: the new file.
+        path: a recording that ``skin-record --wire`` made.
         format_name: one of :data:`WIRE_FORMATS`.
-        selection: the drivers to export; None: all.
-        start_s: begin at this time, s since the recording began.
-        end_s: end before this time; None: at the end of the recording.
-        is_stopped: as for :func:`convert`.
-
-    Raises:
-        BadRecording: the file is not a recording, needs a newer version, or has no wires.
-        ConfigurationError: no wire of a driver was recorded, or sensors are selected, which a wire does not have.
-        OSError: the recording cannot be read, or the new file cannot be written.
+        selection: drivers; it selects no sensors, which a wire does not have.
     """
     form, selection = WIRE_FORMATS[format_name], selection or Selection()
     if selection.sensors:

@@ -6,6 +6,8 @@ import heapq
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,48 +67,21 @@ def _of_table(table: Table) -> Iterator[TimedFrame]:
 _CHUNK_NS = NS_PER_S // 4
 
 
-class _TimedJson(NamedTuple):
-    """An event, or what the clocks were.
-
-    Attributes:
-        time_ns: on the axis of the recording.
-    """
-
-    time_ns: int
-    topic: str
-    data: dict[str, Any]
-
-
 def write_recording(source: TableSource, path: Path) -> None:
-    """Write a source.
-
-    Raises:
-        OSError: it cannot be written.
-    """
     file = RecordingFile(path)
     writer = _RecordingWriter(file)
-    items: list[Iterator[TimedFrame | _TimedJson]] = [
-        *(timed_frames([table]) for table in source.tables),
-        _timed_json(EVENTS, source.events),
-        _timed_json(CLOCK, source.clock),
+    items = [
+        ((each.time_ns, partial(writer.add_frame, each)) for each in timed_frames(source.tables)),
+        ((each["log_time_ns"], partial(writer.add_json, EVENTS, each)) for each in source.events),
+        ((each["log_time_ns"], partial(writer.add_json, CLOCK, each)) for each in source.clock),
     ]
     try:
-        for item in heapq.merge(*items, key=lambda item: item.time_ns):
-            writer.close_chunk_before(item.time_ns)
-            if isinstance(item, TimedFrame):
-                writer.add_frame(item)
-            else:
-                writer.add_json(item)
+        for time_ns, add in heapq.merge(*items, key=itemgetter(0)):
+            writer.close_chunk_before(time_ns)
+            add()
         writer.close_chunk()
     finally:
         file.finish()
-
-
-def _timed_json(topic: str, entries: list[dict[str, Any]]) -> Iterator[_TimedJson]:
-    for each in entries:
-        yield _TimedJson(
-            each["log_time_ns"], topic, {name: value for name, value in each.items() if name != "log_time_ns"}
-        )
 
 
 @dataclass
@@ -132,9 +107,10 @@ class _RecordingWriter:
         channel, schema = self._channels.of_service(timed.service, FRAME)
         self._pending.add_sample(channel, schema, timed.frame, timed.time_ns, stream.encoder, stream.head)
 
-    def add_json(self, item: _TimedJson) -> None:
-        channel, schema = self._channels.of_all(item.topic)
-        self._pending.chunk.add(channel, schema, 0, item.time_ns, json.dumps(item.data).encode())
+    def add_json(self, topic: str, entry: dict[str, Any]) -> None:
+        channel, schema = self._channels.of_all(topic)
+        data = {name: value for name, value in entry.items() if name != "log_time_ns"}
+        self._pending.chunk.add(channel, schema, 0, entry["log_time_ns"], json.dumps(data).encode())
 
     def close_chunk_before(self, time_ns: int) -> None:
         """End the chunk at hand if a message of a time is not to be in it."""
@@ -157,12 +133,7 @@ _BAG_VERSION = 5
 
 
 def write_foxglove(source: TableSource, path: Path) -> None:
-    """Write the pictures and states of drivers, at most 30 times a second, and their events.
-
-    Raises:
-        ConfigurationError: no driver is in it.
-        OSError: it cannot be written.
-    """
+    """Write the pictures and states of drivers, at most 30 times a second, and their events."""
     viewers = Viewers()
     writer = _MessageWriter(path, "")
     try:
@@ -187,12 +158,7 @@ def viewers_without(source: TableSource) -> list[str]:
 
 
 def write_ros2(source: TableSource, folder: Path) -> None:
-    """Write a bag of ROS 2 (rosbag2, storage mcap) into a new folder: every sample, and pictures for viewers.
-
-    Raises:
-        ConfigurationError: no driver is in it.
-        OSError: it cannot be written.
-    """
+    """Write a bag of ROS 2 (rosbag2, storage mcap) into a new folder: every sample, and pictures for viewers."""
     drivers = _drivers(source)
     folder.mkdir()
     name = f"{source.path.stem}_0.mcap"

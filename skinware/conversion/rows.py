@@ -82,11 +82,6 @@ _OF_DRIVERS = {COLUMNS + name for name in ("values", "status", "module_time_ns",
 
 
 def write_csv(source: TableSource, folder: Path) -> None:
-    """Write a source into a folder, which is made.
-
-    Raises:
-        OSError: it cannot be written.
-    """
     folder.mkdir()
     for table in source.tables:
         sensors = sensor_table(table)
@@ -200,12 +195,6 @@ _GROUP_BYTES = 32 << 20
 
 
 def write_parquet(source: TableSource, folder: Path) -> None:
-    """Write a source into a folder, which is made.
-
-    Raises:
-        MissingExtra: pyarrow is not installed.
-        OSError: it cannot be written.
-    """
     arrow = pyarrow()
     folder.mkdir()
     units = []

@@ -5,9 +5,9 @@ Numpy is enough for all of it; functions whose names begin with ``torch_`` need 
 
 from typing import TYPE_CHECKING
 
-from skinware.learning.features import contact_numbers, slip, spectrogram
-from skinware.learning.images import Colours, TouchImage
-from skinware.learning.live import ChosenSensors, LiveImage, LiveTouch, Totals, TouchSample, points
+from skinware.learning.features import Totals, contact_numbers, points, slip, spectrogram
+from skinware.learning.images import Colours, LiveImage, TouchImage
+from skinware.learning.live import ChosenSensors, LiveTouch, TouchOptions, TouchSample
 from skinware.learning.model_service import ModelService, onnx_model
 
 if TYPE_CHECKING:
@@ -23,6 +23,7 @@ __all__ = [
     "StreamedSamples",
     "Totals",
     "TouchImage",
+    "TouchOptions",
     "TouchSample",
     "contact_numbers",
     "onnx_model",

@@ -1,16 +1,85 @@
-"""Features of touch for learning: contacts as rows of numbers, spectrograms, and how likely something slips."""
+"""Features of touch for learning: numbers of modules, point sets, contacts, spectrograms, and slip."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.skin_layout import SkinLayout
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsSample
+
+Positions = npt.NDArray[np.int64]
+Each = Literal["module", "taxel", "point"]
+
+
+class Totals:
+    """Named numbers of some sensors: of each module the sum and the largest value, every sensor, or a point set.
+
+    Args:
+        layout: of the skin.
+        type_name: their type.
+        positions: (n,) as of :meth:`ChosenSensors.of`.
+        each: ``module``: two numbers for each module; ``taxel``: one for each sensor; ``point``: the six of
+            :func:`points` for each sensor.
+
+    Attributes:
+        names: of the numbers: ``right_hand.index_tip.sum``, ``right_hand.index_tip.peak``; ``...taxel_3``;
+            ``...taxel_3.x`` to ``...taxel_3.fz``.
+    """
+
+    def __init__(self, layout: SkinLayout, type_name: str, positions: Positions, each: Each = "module") -> None:
+        module_of = layout.module_of(type_name)[positions]
+        modules, self._row = np.unique(module_of, return_inverse=True)
+        self._each = each
+        self._points: Callable[[npt.NDArray[Any]], npt.NDArray[Any]] = lambda values: points(
+            layout, values, type_name, positions
+        )
+        if each == "module":
+            texts = [layout.modules[module] for module in modules.tolist()]
+            self.names: tuple[str, ...] = tuple(f"{_slug(text)}.{what}" for text in texts for what in ("sum", "peak"))
+        else:
+            self.names = tuple(_slug(layout.sensor_name(type_name, position)) for position in positions.tolist())
+        if each == "point":
+            self.names = tuple(f"{name}.{axis}" for name in self.names for axis in ("x", "y", "z", "fx", "fy", "fz"))
+
+    def of(self, values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+        """Return (len(names),) float32 of (n,) values."""
+        if self._each == "point":
+            return self._points(values).ravel()
+        if self._each == "taxel" or not len(values):
+            return values.astype(np.float32)
+        sums = np.bincount(self._row, values)
+        peaks = np.full(len(sums), -np.inf)
+        np.maximum.at(peaks, self._row, values)
+        return np.column_stack((sums, peaks)).ravel().astype(np.float32)
+
+
+def points(layout: SkinLayout, values: npt.NDArray[Any], type_name: str, positions: Positions) -> npt.NDArray[Any]:
+    """Return (..., n, 6) float32 ``[x, y, z, Fx, Fy, Fz]``: places in m in their frames, and force against the skin.
+
+    The force is the value, in the unit of the type, against the outward normal; 0 where the normal is not known, as is
+    the place.
+
+    Args:
+        values: (..., n) of the sensors at ``positions``.
+    """
+    geometry = layout.geometry(type_name)
+    place = np.nan_to_num(geometry.position_m[positions])
+    force = -values[..., np.newaxis] * np.nan_to_num(geometry.normal[positions])
+    found: npt.NDArray[np.float32] = np.concatenate((np.broadcast_to(place, force.shape), force), axis=-1).astype("f4")
+    return found
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^A-Za-z0-9.]+", "_", text.replace(", ", ".")).strip("_")
+
 
 CONTACT_NUMBERS = ("load", "peak", "x_m", "y_m", "z_m", "normal_x", "normal_y", "normal_z", "age_s")
 """Names of the columns of :func:`contact_numbers`."""

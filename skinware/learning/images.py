@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
+from skinware.learning.live import LiveTouch, TouchSample
 from skinware.matrices import filled_by
+from skinware.realtime import now_ns
 from skinware.skin_layout import SkinLayout
+from skinware.tactile.contacts import NO_CONTACT
 
 Pixels = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.int64]
@@ -115,6 +118,98 @@ class TouchImage:
         colours = np.concatenate((self.colours.of_values(values), np.zeros((1, 3), np.uint8)))
         pixels: Pixels = colours[self.sensor]
         return pixels
+
+
+class LiveImage:
+    """Live touch as images: see :class:`TouchImage`.
+
+    Args:
+        touch: what is shown; with colours ``shear`` of the normal component, such as ``force_z``.
+        height, width: of the images, pixels.
+        map: of the colours.
+        lowest, highest: range of the colours; default: that of the drivers' sensor type.
+        tangential: types of the two tangential components for ``shear``, of the same taxels.
+        shows: the ``values``; or, of touch with contacts, ``contacts``: of each taxel the load of its contact.
+    """
+
+    def __init__(
+        self,
+        touch: LiveTouch,
+        height: int,
+        width: int,
+        map: ColourMap = "grey",  # noqa: A002, as in Colours
+        *,
+        lowest: float | None = None,
+        highest: float | None = None,
+        tangential: tuple[str, str] = ("force_x", "force_y"),
+        shows: Literal["values", "contacts"] = "values",
+    ) -> None:
+        self.touch, self._shows = touch, shows
+        self._size, self._map, self._range, self._tangential = (height, width), map, (lowest, highest), tangential
+        self._image: TouchImage | None = None
+
+    def open(self, *, timeout_s: float = 5.0) -> Self:
+        """Open the touch, and lay out the image.
+
+        Raises:
+            ConfigurationError: the drivers give no range, the image is too small, or the components are not of the same
+                taxels.
+            ServiceTimeout, StructureError: as :meth:`LiveTouch.open`.
+        """
+        self.touch.open(timeout_s=timeout_s)
+        layout, type_name = self.touch.layout, self.touch.sensors.type_name
+        try:
+            lowest, highest = self._range
+            own = range_of(layout, type_name)
+            lowest, highest = own[0] if lowest is None else lowest, own[1] if highest is None else highest
+            if self._map == "shear" and any(
+                not np.array_equal(layout.uids(name), layout.uids(type_name)) for name in self._tangential
+            ):
+                raise ConfigurationError(f"{', '.join(self._tangential)} are not of the same taxels as {type_name}")
+            colours = Colours(self._map, lowest, highest)
+            self._image = TouchImage(layout, type_name, self.touch.positions, *self._size, colours)
+        except BaseException:
+            self.touch.close()
+            raise
+        return self
+
+    def now(self) -> tuple[Pixels, TouchSample]:
+        """Return (height, width, 3) uint8, and the touch it shows; errors as :meth:`LiveTouch.now`."""
+        return self.at(now_ns())
+
+    def at(self, time_ns: int) -> tuple[Pixels, TouchSample]:
+        """Return the image of a moment, as :meth:`LiveTouch.at`."""
+        return self._shown(self.touch.at(time_ns))
+
+    def newer(self, *, timeout_s: float) -> tuple[Pixels, TouchSample]:
+        """Return the next image, as :meth:`LiveTouch.newer`."""
+        return self._shown(self.touch.newer(timeout_s=timeout_s))
+
+    def _shown(self, touch: TouchSample) -> tuple[Pixels, TouchSample]:
+        if self._image is None:
+            raise ConfigurationError("an image is read before it was opened")
+        values = self._loads(touch) if self._shows == "contacts" else touch.values
+        if self._map == "shear":
+            parts = [touch.snapshot.physical(name)[self.touch.positions] * touch.fresh for name in self._tangential]
+            values = np.stack((*parts, values), axis=1)
+        return self._image.of(values), touch
+
+    def _loads(self, touch: TouchSample) -> npt.NDArray[Any]:
+        """(n,) load of the contact that each sensor is in; 0: in none."""
+        layout, type_name = self.touch.layout, self.touch.sensors.type_name
+        loads = np.zeros(len(layout.uids(type_name)))
+        if touch.contacts is None:
+            raise ConfigurationError("contacts cannot be shown: make LiveTouch with contacts_in")
+        source, found = touch.contacts.source, touch.contacts.contacts
+        own = np.flatnonzero(layout.driver_of(type_name) == list(layout.drivers).index(source.driver))
+        if source.type_name != type_name or not np.array_equal(layout.uids(type_name)[own], source.uid):
+            raise ConfigurationError(f"the contacts are of {source.type_name} of {source.driver}, not of {type_name}")
+        loads[own] = np.append(found.load, 0.0)[np.maximum(found.contact_of, NO_CONTACT)]
+        return loads[self.touch.positions]
+
+    def close(self) -> None:
+        """Detach from all drivers. Idempotent."""
+        self.touch.close()
 
 
 def _field(kind: str, count: int, places: npt.NDArray[np.float64], height: int, width: int) -> Positions:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import re
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -13,13 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, ServiceTimeout
-from skinware.learning.images import ColourMap, Colours, Pixels, TouchImage, range_of
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.skin import Skin
 from skinware.skin_layout import SkinLayout
 from skinware.snapshot import Snapshot
 from skinware.status import age_limit_ns
+from skinware.tactile.contacts_service import ContactsReader, ContactsSample
 from skinware.tactile.regions import Region, Regions, read_regions
 
 Positions = npt.NDArray[np.int64]
@@ -74,6 +73,7 @@ class TouchSample(NamedTuple):
         fresh: (n,) bool, as of the moment.
         off_s: time of the data minus the moment, s: the driver furthest away.
         is_held: nothing young enough came, and this is the last touch before.
+        contacts: the newest ones, of :class:`LiveTouch` with contacts; None: it has none.
     """
 
     snapshot: Snapshot
@@ -81,6 +81,7 @@ class TouchSample(NamedTuple):
     fresh: npt.NDArray[np.bool_]
     off_s: float
     is_held: bool
+    contacts: ContactsSample | None = None
 
 
 class LiveTouch:
@@ -94,6 +95,7 @@ class LiveTouch:
         namespace: default: the one of ``SKINWARE_NAMESPACE``.
         max_age_s: oldest data of each driver; default: three periods of the driver, at least 0.2 s.
         when_stale: ``raise`` a ServiceTimeout when a driver died, is silent or changed; or ``hold`` the last touch.
+        contacts_in: namespace of the service ``contacts``, whose newest sample comes with the touch; None: without.
 
     Attributes:
         layout: of the skin when it was opened.
@@ -108,8 +110,11 @@ class LiveTouch:
         namespace: Namespace | str | None = None,
         max_age_s: float | None = None,
         when_stale: Literal["raise", "hold"] = "raise",
+        contacts_in: Namespace | str | None = None,
     ) -> None:
         self.sensors = ChosenSensors() if sensors is None else sensors
+        self._contacts_in = contacts_in
+        self._contacts: ContactsReader | None = None
         self._namespace, self._drivers = namespace, drivers
         self._max_age_s, self._when_stale = max_age_s, when_stale
         self._skin: Skin | None = None
@@ -126,7 +131,7 @@ class LiveTouch:
         """Attach to the drivers, and wait for a sample of each.
 
         Raises:
-            ServiceTimeout: they did not all publish in time.
+            ServiceTimeout, ServiceNotFound: they did not all publish in time, or no contacts.
             StructureError, ConfigurationError: as :meth:`ChosenSensors.of`.
         """
         wanted = self._drivers
@@ -146,6 +151,8 @@ class LiveTouch:
             self.layout = snapshot.layout
             snapshot.unit(self.sensors.type_name)
             self.positions = self.sensors.of(self.layout)
+            if self._contacts_in is not None:
+                self._contacts = ContactsReader(namespace=self._contacts_in, timeout_s=timeout_s)
         except BaseException:
             skin.close()
             raise
@@ -169,26 +176,48 @@ class LiveTouch:
         Args:
             time_ns: the moment, CLOCK_MONOTONIC ns: now or a little earlier.
         """
-        if self._skin is None:
-            raise ConfigurationError("touch is read before it was opened")
-        try:
-            snapshot = self._nearest(self._skin, time_ns)
-        except ServiceTimeout:
-            if self._when_stale == "raise" or self._last is None:
-                raise
-            return self._last._replace(is_held=True)
-        type_name = self.sensors.type_name
-        fresh = snapshot.fresh(type_name, max_age_s=self._max_age_s, at_ns=time_ns)[self.positions]
-        values = np.where(fresh, snapshot.physical(type_name)[self.positions], 0)
-        off_ns = snapshot.acquired_ns - time_ns
-        self._last = TouchSample(snapshot, values, fresh, float(off_ns[np.argmax(np.abs(off_ns))]) / NS_PER_S, False)
-        return self._last
+        skin = self._opened()
+        return self._taken(lambda: self._nearest(skin, time_ns), time_ns)
+
+    def newer(self, *, timeout_s: float) -> TouchSample:
+        """Return touch that is newer than the one returned before, as soon as a driver publishes it.
+
+        Raises:
+            ServiceTimeout: nothing newer came in time; or as :meth:`now`.
+            ConfigurationError: it is not open.
+        """
+        skin, last = self._opened(), self._last
+        with contextlib.suppress(ServiceTimeout):
+            skin.read(newer_than=last and last.snapshot, timeout_s=timeout_s)
+        touch = self._taken(lambda: skin.read(timeout_s=0.0), now_ns())
+        if last and not touch.is_held and (touch.snapshot.acquired_ns <= last.snapshot.acquired_ns).all():
+            raise ServiceTimeout(f"no newer touch within {timeout_s:g} s")
+        return touch
 
     def close(self) -> None:
         """Detach from all drivers. Idempotent."""
         if self._skin is not None:
             self._skin.close()
-        self._skin = None
+        if self._contacts is not None:
+            self._contacts.close()
+        self._skin = self._contacts = None
+
+    def _opened(self) -> Skin:
+        if self._skin is None:
+            raise ConfigurationError("touch is read before it was opened")
+        return self._skin
+
+    def _taken(self, take: Callable[[], Snapshot], time_ns: int) -> TouchSample:
+        """Return the touch in a snapshot, or hold the last one."""
+        try:
+            snapshot = take()
+            self._check(snapshot)
+            self._last = self._sample(snapshot, time_ns)
+        except ServiceTimeout:
+            if self._when_stale == "raise" or self._last is None:
+                raise
+            return self._last._replace(is_held=True)
+        return self._last
 
     def _nearest(self, skin: Skin, time_ns: int) -> Snapshot:
         snapshot = skin.read(timeout_s=0.0)
@@ -197,16 +226,30 @@ class LiveTouch:
         while (left_ns := time_ns + longest_ns - now_ns()) > 0 and self._may_be_nearer(snapshot, time_ns):
             with contextlib.suppress(ServiceTimeout):
                 snapshot = skin.read(newer_than=snapshot, timeout_s=left_ns / NS_PER_S)
-        nearest = skin.at(time_ns).nearest
-        self._check(nearest)
+        return skin.at(time_ns).nearest
+
+    def _sample(self, snapshot: Snapshot, time_ns: int) -> TouchSample:
+        contacts = None if self._contacts is None else self._contacts.latest()
+        ages = [
+            (name, time_ns - sample.acquired_ns, sample.period_ns)
+            for name, sample in zip(snapshot.layout.drivers, snapshot.samples, strict=True)
+        ]
+        if self._contacts is not None:
+            longest_ns = max(period_ns for _, _, period_ns in ages)
+            ages.append(("contacts", time_ns - (contacts.acquired_ns if contacts else 0), longest_ns))
         too_old = [
-            f"{name} ({(time_ns - sample.acquired_ns) / NS_PER_S:.2f} s)"
-            for name, sample in zip(nearest.layout.drivers, nearest.samples, strict=True)
-            if time_ns - sample.acquired_ns > self._limit_ns(sample.period_ns)
+            f"{name} ({age_ns / NS_PER_S:.2f} s)"
+            for name, age_ns, period_ns in ages
+            if age_ns > self._limit_ns(period_ns)
         ]
         if too_old:
             raise ServiceTimeout(f"drivers whose data is too old: {', '.join(too_old)}")
-        return nearest
+        type_name = self.sensors.type_name
+        fresh = snapshot.fresh(type_name, max_age_s=self._max_age_s, at_ns=time_ns)[self.positions]
+        values = np.where(fresh, snapshot.physical(type_name)[self.positions], 0)
+        off_ns = snapshot.acquired_ns - time_ns
+        off_s = float(off_ns[np.argmax(np.abs(off_ns))]) / NS_PER_S
+        return TouchSample(snapshot, values, fresh, off_s, False, contacts)
 
     def _may_be_nearer(self, snapshot: Snapshot, time_ns: int) -> bool:
         """Return whether a sample to come can be nearer to the moment than the newest one."""
@@ -236,127 +279,49 @@ class LiveTouch:
         self.close()
 
 
-class LiveImage:
-    """Live touch as images: see :class:`skinware.learning.images.TouchImage`.
-
-    Args:
-        touch: what is shown; with colours ``shear`` of the normal component, such as ``force_z``.
-        height, width: of the images, pixels.
-        map: of the colours.
-        lowest, highest: range of the colours; default: that of the drivers' sensor type.
-        tangential: types of the two tangential components for ``shear``, of the same taxels.
-    """
-
-    def __init__(
-        self,
-        touch: LiveTouch,
-        height: int,
-        width: int,
-        map: ColourMap = "grey",  # noqa: A002, as in Colours
-        *,
-        lowest: float | None = None,
-        highest: float | None = None,
-        tangential: tuple[str, str] = ("force_x", "force_y"),
-    ) -> None:
-        self.touch = touch
-        self._size, self._map, self._range, self._tangential = (height, width), map, (lowest, highest), tangential
-        self._image: TouchImage | None = None
-
-    def open(self, *, timeout_s: float = 5.0) -> Self:
-        """Open the touch, and lay out the image.
-
-        Raises:
-            ConfigurationError: the drivers give no range, the image is too small, or the components are not of the same
-                taxels.
-            ServiceTimeout, StructureError: as :meth:`LiveTouch.open`.
-        """
-        self.touch.open(timeout_s=timeout_s)
-        layout, type_name = self.touch.layout, self.touch.sensors.type_name
-        try:
-            lowest, highest = self._range
-            own = range_of(layout, type_name)
-            lowest, highest = own[0] if lowest is None else lowest, own[1] if highest is None else highest
-            if self._map == "shear" and any(
-                not np.array_equal(layout.uids(name), layout.uids(type_name)) for name in self._tangential
-            ):
-                raise ConfigurationError(f"{', '.join(self._tangential)} are not of the same taxels as {type_name}")
-            colours = Colours(self._map, lowest, highest)
-            self._image = TouchImage(layout, type_name, self.touch.positions, *self._size, colours)
-        except BaseException:
-            self.touch.close()
-            raise
-        return self
-
-    def now(self) -> tuple[Pixels, TouchSample]:
-        """Return (height, width, 3) uint8, and the touch it shows; errors as :meth:`LiveTouch.now`."""
-        return self.at(now_ns())
-
-    def at(self, time_ns: int) -> tuple[Pixels, TouchSample]:
-        """Return the image of a moment, as :meth:`LiveTouch.at`."""
-        touch = self.touch.at(time_ns)
-        if self._image is None:
-            raise ConfigurationError("an image is read before it was opened")
-        values = touch.values
-        if self._map == "shear":
-            parts = [touch.snapshot.physical(name)[self.touch.positions] * touch.fresh for name in self._tangential]
-            values = np.stack((*parts, values), axis=1)
-        return self._image.of(values), touch
-
-    def close(self) -> None:
-        """Detach from all drivers. Idempotent."""
-        self.touch.close()
-
-
-class Totals:
-    """Named numbers of some sensors: of each module the sum and the largest value, or every sensor.
-
-    Args:
-        layout: of the skin.
-        type_name: their type.
-        positions: (n,) as of :meth:`ChosenSensors.of`.
-        each: ``module``: two numbers for each module; ``taxel``: one for each sensor.
+@dataclass(kw_only=True)
+class TouchOptions:
+    """Options of live touch for configurations of other programs, where an empty text means the default.
 
     Attributes:
-        names: of the numbers: ``right_hand.index_tip.sum``, ``right_hand.index_tip.peak``; ``...taxel_3``.
+        driver: name of a driver; empty: all that run when it is opened.
+        namespace: of the driver; empty: the one of ``SKINWARE_NAMESPACE``.
+        type_name: type of the sensors.
+        modules: names of modules or patches, or of regions if there is a file of them; empty: all sensors.
+        regions: a file of regions.
+        max_age_ms: oldest data; default: three periods of the driver, at least 200 ms.
+        when_stale: ``raise`` an error when a driver died or is silent, or ``hold`` the last touch.
+        contacts_namespace: of the service ``contacts``, where contacts are asked for.
+        timeout_s: longest wait for the drivers.
     """
 
-    def __init__(
-        self, layout: SkinLayout, type_name: str, positions: Positions, each: Literal["module", "taxel"] = "module"
-    ) -> None:
-        module_of = layout.module_of(type_name)[positions]
-        modules, self._row = np.unique(module_of, return_inverse=True)
-        self._each = each
-        if each == "module":
-            texts = [layout.modules[module] for module in modules.tolist()]
-            self.names: tuple[str, ...] = tuple(f"{_slug(text)}.{what}" for text in texts for what in ("sum", "peak"))
-        else:
-            self.names = tuple(_slug(layout.sensor_name(type_name, position)) for position in positions.tolist())
+    driver: str = ""
+    namespace: str = ""
+    type_name: str = "pressure"
+    modules: list[str] = field(default_factory=list)
+    regions: str = ""
+    max_age_ms: float | None = None
+    when_stale: str = "raise"
+    contacts_namespace: str = "calm"
+    timeout_s: float = 5.0
 
-    def of(self, values: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-        """Return (len(names),) float32 of (n,) values."""
-        if self._each == "taxel" or not len(values):
-            return values.astype(np.float32)
-        sums = np.bincount(self._row, values)
-        peaks = np.full(len(sums), -np.inf)
-        np.maximum.at(peaks, self._row, values)
-        return np.column_stack((sums, peaks)).ravel().astype(np.float32)
+    def check(self, **known: tuple[str, ...]) -> None:
+        """Check options that are one of some words: ``when_stale``, and those of a class derived from this one.
 
+        Raises:
+            ValueError: an option is none of its words; the message lists them.
+        """
+        for name, words in {"when_stale": ("raise", "hold"), **known}.items():
+            if getattr(self, name) not in words:
+                raise ValueError(f"{name} is {getattr(self, name)!r}: give one of {', '.join(words)}")
 
-def points(layout: SkinLayout, values: npt.NDArray[Any], type_name: str, positions: Positions) -> npt.NDArray[Any]:
-    """Return (..., n, 6) float32 ``[x, y, z, Fx, Fy, Fz]``: places in m in their frames, and force against the skin.
-
-    The force is the value, in the unit of the type, against the outward normal; 0 where the normal is not known, as is
-    the place.
-
-    Args:
-        values: (..., n) of the sensors at ``positions``.
-    """
-    geometry = layout.geometry(type_name)
-    place = np.nan_to_num(geometry.position_m[positions])
-    force = -values[..., np.newaxis] * np.nan_to_num(geometry.normal[positions])
-    found: npt.NDArray[np.float32] = np.concatenate((np.broadcast_to(place, force.shape), force), axis=-1).astype("f4")
-    return found
-
-
-def _slug(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9.]+", "_", text.replace(", ", ".")).strip("_")
+    def touch(self, *, with_contacts: bool = False) -> LiveTouch:
+        """Return the touch of these options, to be opened."""
+        return LiveTouch(
+            ChosenSensors(self.type_name, tuple(self.modules), self.regions or None),
+            drivers=[self.driver] if self.driver else None,
+            namespace=self.namespace or None,
+            max_age_s=None if self.max_age_ms is None else self.max_age_ms / 1000,
+            when_stale="hold" if self.when_stale == "hold" else "raise",
+            contacts_in=self.contacts_namespace if with_contacts else None,
+        )

@@ -6,6 +6,7 @@ file, or kept for later. https://mcap.dev/spec defines the format.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import struct
@@ -14,8 +15,8 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO
 
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -40,7 +41,7 @@ COMPRESSION = "zstd"
 _LEVEL = 1  # higher levels find chance matches in noise, which cost time and bytes
 _MESSAGE = struct.Struct("<BQHIQQ")
 _LEAST_FREE = 64 << 10  # bytes of the disk that are kept free for the last heads, besides the summary
-_SPOOL_BYTES = 64 << 10  # records of the summary in memory: those of 500 chunks, two minutes
+_SPOOL_BYTES = 64 << 10  # records of the summary in memory: those of 500 chunks, two minutes; others are in a file
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ class McapFile:
         self.counts: Counter[int] = Counter()
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
-        self._index = _Spool(path.parent)
+        self._index = tempfile.SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent))  # noqa: SIM115
         self._chunks = 0
         self._start_ns, self._end_ns = (1 << 64) - 1, 0
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
@@ -200,18 +201,22 @@ class McapFile:
         """Append a chunk, or raise OSError: the file stays without it."""
         self.check()
         free = os.fstatvfs(self._fd)
-        summary_size = 2048 + self._index.size
+        index_size = self._index.tell()
+        summary_size = 2048 + index_size
         if free.f_bavail * free.f_frsize < len(chunk.record) + 2 * summary_size + _LEAST_FREE:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
         index = chunk.index
         offsets = {channel: self.size + at for channel, at in index.message_index_offsets.items()}
         moved = replace(index, chunk_start_offset=self.size, message_index_offsets=offsets)
         try:
-            self._index.save()
+            self._index.write(_bytes(moved))
+            self._index.flush()
+            self._append([chunk.record])
         except OSError as error:
+            with contextlib.suppress(OSError):
+                self._index.seek(index_size)
+                self._index.truncate()
             raise OSError(error.errno, error.strerror, str(self.path)) from None
-        self._append([chunk.record])
-        self._index.add(_bytes(moved))
         self._chunks += 1
         self._start_ns, self._end_ns = min(self._start_ns, chunk.start_ns), max(self._end_ns, chunk.end_ns)
         self._channels |= chunk.channels
@@ -250,8 +255,9 @@ class McapFile:
             (Opcode.SCHEMA, map(_bytes, self._schemas.values())),
             (Opcode.CHANNEL, map(_bytes, self._channels.values())),
             (Opcode.STATISTICS, [_bytes(statistics)]),
-            (Opcode.CHUNK_INDEX, self._index.parts()),
+            (Opcode.CHUNK_INDEX, iter(partial(self._index.read, _SPOOL_BYTES), b"")),
         ]
+        self._index.seek(0)
         at, crc, offsets = start, 0, b""
         for opcode, parts in groups:
             begin = at
@@ -278,47 +284,6 @@ class McapFile:
             os.lseek(self._fd, self.size, os.SEEK_SET)
             raise OSError(error.errno, error.strerror, str(self.path)) from None
         self.size = size
-
-
-class _Spool:
-    """Records of a summary, kept in an unnamed file beside the recording instead of in memory."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._file: BinaryIO | None = None
-        self._waiting = bytearray()
-        self._saved = 0
-
-    @property
-    def size(self) -> int:
-        return self._saved + len(self._waiting)
-
-    def add(self, record: bytes) -> None:
-        self._waiting += record
-
-    def save(self) -> None:
-        if len(self._waiting) < _SPOOL_BYTES:
-            return
-        if self._file is None:
-            self._file = tempfile.TemporaryFile(buffering=0, dir=self._folder)  # noqa: SIM115
-        self._file.seek(self._saved)
-        rest = memoryview(self._waiting)
-        while rest:
-            rest = rest[self._file.write(rest) :]
-        self._saved += len(self._waiting)
-        self._waiting = bytearray()
-
-    def parts(self) -> Iterator[bytes]:
-        if self._file is not None:
-            self._file.seek(0)
-            for begin in range(0, self._saved, _SPOOL_BYTES):
-                yield self._file.read(min(_SPOOL_BYTES, self._saved - begin))
-        yield bytes(self._waiting)
-
-    def close(self) -> None:
-        if self._file is not None:
-            self._file.close()
-        self._file, self._waiting, self._saved = None, bytearray(), 0
 
 
 def _bytes(record: McapRecord) -> bytes:

@@ -74,8 +74,9 @@ class _Tape:
         return moment
 
     def go_to(self, time_s: float) -> None:
+        """Publish what was newest at a time, samples of this very time among it."""
         self._put_back()
-        self._timeline.seek(time_s)
+        self._timeline.seek(min(math.nextafter(time_s, math.inf), self._end_s))
         self.reached_s = time_s
         self._show(self._timeline.services)
 

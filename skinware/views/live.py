@@ -264,17 +264,20 @@ class Overview:
         self.drivers.close()
 
 
+def only_driver(namespace: Namespace, how: str) -> str:
+    """Return the name of the only driver that runs; ``how`` to choose one is for the message."""
+    with Skin(namespace) as skin:
+        drivers = skin.refresh().drivers
+    if not drivers:
+        raise ServiceNotFound(f"no driver runs in namespace {namespace.name!r}")
+    if len(drivers) > 1:
+        raise ConfigurationError(f"several drivers run: choose one with {how}: {', '.join(drivers)}")
+    return drivers[0]
+
+
 def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReader:
     """Return a reader of a driver, or of the only one that runs; ``how`` to choose one is for the message."""
-    if driver is None:
-        with Skin(namespace) as skin:
-            drivers = skin.refresh().drivers
-        if not drivers:
-            raise ServiceNotFound(f"no driver runs in namespace {namespace.name!r}")
-        if len(drivers) > 1:
-            raise ConfigurationError(f"several drivers run: choose one with {how}: {', '.join(drivers)}")
-        driver = drivers[0]
-    return DriverReader(driver, namespace=namespace)
+    return DriverReader(driver or only_driver(namespace, how), namespace=namespace)
 
 
 def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[DriverSnapshot]:

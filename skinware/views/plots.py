@@ -14,11 +14,12 @@ from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import Overrun, ServiceError, ServiceTimeout
 from skinware.memory.namespace import Namespace
+from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 from skinware.status import Status
 from skinware.structure import Structure
-from skinware.tactile.contacts_service import ContactsReader, ContactsSample
+from skinware.tactile.contacts_service import ContactsReader
 from skinware.views.following import Follower, PlotFunction, ShownDriver
 from skinware.views.looks import Line
 from skinware.views.quantities import WITHOUT_VALUE
@@ -43,9 +44,10 @@ class _PlotSource(NamedTuple):
 
 
 class PlotBlock(NamedTuple):
-    """(k,) int64 ns, CLOCK_MONOTONIC of publication, and (k, m) values of m lines, NaN without one.
+    """(k,) int64 ns, when samples were published, and (k, m) values of m lines, NaN without one.
 
-    ``number`` is that of the viewer's choice, of which ``lines`` are places.
+    ``number`` is that of the viewer's choice, of which ``lines`` are places. Times are those of CLOCK_MONOTONIC; of a
+    recording, those since it began. ``begins``: what came before is to be forgotten.
     """
 
     number: int
@@ -53,63 +55,67 @@ class PlotBlock(NamedTuple):
     lines: list[int]
     time_ns: npt.NDArray[np.int64]
     values: Values
+    begins: bool = False
+
+
+class Rows:
+    """The values of lines in sample after sample, ``most`` at once; missing samples are a row without values."""
+
+    def __init__(self, most: int | None = None) -> None:
+        self.missed = 0
+        self.last: tuple[int, int] | None = None
+        self._rows: deque[tuple[int, Values]] = deque(maxlen=most)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, position: tuple[int, int], time_ns: int, values: Values) -> None:
+        last, self.last = self.last, position
+        if last is not None and position != (last[0], last[1] + 1):
+            self.missed += max(1, position[1] - last[1] - 1)
+            self._rows.append((time_ns - 1, np.full(len(values), np.nan)))
+        self.missed += len(self._rows) == self._rows.maxlen
+        self._rows.append((time_ns, values))
+
+    def block(self, number: int, of: str, lines: list[int], *, begins: bool = False) -> PlotBlock:
+        """Return the rows, and forget them."""
+        rows = list(self._rows)
+        self._rows.clear()
+        values = np.array([values for _, values in rows], np.float64).reshape(len(rows), len(lines))
+        times = np.array([time_ns for time_ns, _ in rows], np.int64)
+        return PlotBlock(number, of, lines, times, values, begins)
 
 
 class _Feed:
     def __init__(self, source: _PlotSource) -> None:
         reader = ContactsReader if source.of == "contacts" else DriverReader
         self.reader: ServiceReader[Any] = reader(source.name, namespace=source.namespace, announce=False)
-        self.of, self.number, self.missed = source.of, 0, 0
+        self.of, self.number = source.of, 0
         self.lines: dict[int, Line] = {}
+        self.rows = Rows(_MOST_SAMPLES)
         self._values: Callable[[Any], Values] = lambda _: np.zeros(0)
-        self._rows: deque[tuple[int, Values]] = deque(maxlen=_MOST_SAMPLES)
-        self._last: tuple[int, int] | None = None
 
     def choose(
         self, number: int, lines: dict[int, Line], driver: ShownDriver, functions: Mapping[str, PlotFunction]
     ) -> None:
         """Take the values of these lines, by their places in a choice, from now on."""
         self.number, self.lines = number, lines
-        if self.of == "contacts":
-            ids = [line.contact for line in lines.values()]
-
-            def loads(sample: ContactsSample) -> Values:
-                known = dict(zip(sample.contacts.id.tolist(), sample.contacts.load.tolist(), strict=True))
-                return np.array([known.get(contact, np.nan) for contact in ids])
-
-            self._values = loads
-        elif self.of == "function":
-            names = [line.function or "" for line in lines.values()]
-            self._values = lambda frame: np.array([functions[name](frame) for name in names])
-        else:
-            self._values = _totals(driver, list(lines.values()))
+        self._values = values_of(self.of, list(lines.values()), driver, functions)
 
     def take(self) -> bool:
         """Take the newer samples, and return whether some wait; raise what the reader raises."""
         latest = self.reader.refresh()
-        if latest is not None and latest != self._last:
+        if latest is not None and latest != self.rows.last:
             with contextlib.suppress(ServiceTimeout, Overrun):
                 for sample in self.reader.in_order(timeout_s=0.0):
-                    self._add(sample)
+                    self.rows.add(sample.position, sample.published_ns, self._values(sample))
                     if sample.position >= latest:
                         break
-        return bool(self._rows)
-
-    def _add(self, sample: Any) -> None:
-        last, self._last = self._last, sample.position
-        if last is not None and sample.position != (last[0], last[1] + 1):  # a gap is seen as one
-            self.missed += max(1, sample.position[1] - last[1] - 1)
-            self._rows.append((sample.published_ns - 1, np.full(len(self.lines), np.nan)))
-        self.missed += len(self._rows) == _MOST_SAMPLES
-        self._rows.append((sample.published_ns, self._values(sample)))
+        return len(self.rows) > 0
 
     def block(self) -> PlotBlock:
         """Return the samples that wait; they are forgotten."""
-        rows = list(self._rows)
-        self._rows.clear()
-        values = np.array([values for _, values in rows], np.float64).reshape(len(rows), len(self.lines))
-        times = np.array([time_ns for time_ns, _ in rows], np.int64)
-        return PlotBlock(self.number, self.of, list(self.lines), times, values)
+        return self.rows.block(self.number, self.of, list(self.lines))
 
 
 class Plots:
@@ -127,7 +133,7 @@ class Plots:
     @property
     def missed(self) -> int:
         """Samples that came since a service is plotted, and were not taken or not sent."""
-        return sum(feed.missed for feed in self._feeds.values())
+        return sum(feed.rows.missed for feed in self._feeds.values())
 
     def choose(self, number: int, lines: list[Line], edition: int) -> None:
         """Send the values of lines of this edition from now on; of new taxels also those of the last seconds."""
@@ -211,6 +217,25 @@ def _units_of(structure: Structure, sensors: Sensors) -> tuple[Values, Values]:
     by_id = {t.id: (t.scale, t.offset) for t in structure.types}
     units = np.array([by_id[of_type] for of_type in structure.sensor_type[sensors].tolist()]).reshape(-1, 2)
     return units[:, 0], units[:, 1]
+
+
+def values_of(
+    of: str, lines: list[Line], driver: ShownDriver, functions: Mapping[str, PlotFunction]
+) -> Callable[[Any], Values]:
+    """Return a function of a sample of a driver or of contacts: (m,) the values of lines."""
+    if of == "contacts":
+        ids = [line.contact for line in lines]
+
+        def loads(sample: Sample) -> Values:
+            filled = slice(0, int(sample.column("count")[0]))
+            known = dict(zip(sample.column("id")[filled].tolist(), sample.column("load")[filled].tolist(), strict=True))
+            return np.array([known.get(contact, np.nan) for contact in ids])
+
+        return loads
+    if of == "function":
+        names = [line.function or "" for line in lines]
+        return lambda frame: np.array([functions[name](frame) for name in names])
+    return _totals(driver, lines)
 
 
 def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot], Values]:

@@ -116,11 +116,10 @@ class Scene:
     Taxels with places in one coordinate frame are one body, also those of several drivers. A driver is a body of its
     own in a nominal frame, and where its taxels would lie on those of another driver. The first body of a frame with a
     pose is placed by that pose, and the first other body by its own coordinates. All further bodies stand beside them
-    in the order of the names of their drivers, then taxels without places. So nothing covers anything else, and the
-    order in which drivers were started changes nothing.
+    in the order of their drivers, then taxels without places. So nothing covers anything else.
 
     Args:
-        drivers: structure and quantities of each driver, by name.
+        drivers: structure and quantities of each driver, by name, in the order in which they are to stand.
     """
 
     def __init__(
@@ -164,7 +163,7 @@ class Scene:
         return found
 
     def _arrange_bodies(self, bodies: Sequence[_Body]) -> None:
-        for body in sorted(bodies, key=lambda body: (not self._is_placed(body), body.drivers[0], body.frame)):
+        for body in sorted(bodies, key=lambda body: not self._is_placed(body)):
             pose = self._poses.get(body.frame, np.eye(4)).copy()
             side, outlines = side_of(body.frame), []
             if side is not None:  # the parts of a nominal hand on which the taxels are, and the palm
@@ -230,19 +229,19 @@ class _Body:
 
 
 def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
-    """Return all bodies; the drivers of each are in the order of their names."""
-    found: dict[str, list[_Body]] = {}
-    for driver, geometry in sorted(geometries.items()):
-        for frame in _frames(geometry):
-            bodies = found.setdefault(frame, [])
+    """Return all bodies, in the order of their drivers."""
+    found: list[_Body] = []
+    for driver, geometry in geometries.items():
+        for frame in sorted(_frames(geometry)):
+            bodies = [body for body in found if body.frame == frame]
             at = geometry.position_m[geometry.known & (geometry.frame == frame)]
             shared = [] if _NOMINAL in frame else [body for body in bodies if not _is_same(body.at, at)]
             if shared:
                 shared[0].drivers.append(driver)
                 shared[0].at = np.concatenate([shared[0].at, at])
             else:
-                bodies.append(_Body(frame, not bodies, [driver], at))
-    return [body for bodies in found.values() for body in bodies]
+                found.append(_Body(frame, not bodies, [driver], at))
+    return found
 
 
 def _is_same(one: npt.NDArray[np.float64], other: npt.NDArray[np.float64]) -> bool:

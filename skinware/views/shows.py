@@ -116,6 +116,7 @@ class PlayedRecording:
         title: of the recording.
 
     Attributes:
+        began_s: when the recording began, s since 1970.
         state: as :meth:`skinware.recording.replaying.Replayer.replay` returns it.
         outline: of the part so far, as the page reads it; another thread makes it, and replaces it.
         problems: of the file, and why it stopped.
@@ -135,6 +136,7 @@ class PlayedRecording:
         self._is_over = threading.Event()
         self._failure: str | None = None
         self._of_file = self._recording.problems
+        self.began_s: float = self._recording.start_ns / NS_PER_S
         self.state: dict[str, Any] = self._replayer.replay()
         self.outline: dict[str, Any] = {}
         self._threads = [threading.Thread(target=run, name="recording") for run in (self._play, self._make_outline)]
@@ -228,7 +230,7 @@ class Show:
     def replays(self) -> list[dict[str, Any]]:
         """The states of the replays, each with the title of its recording."""
         if self.played:
-            return [{**played.state, "title": played.title} for played in self.played]
+            return [{**one.state, "title": one.title, "began_s": one.began_s} for one in self.played]
         return [] if self._control.state is None else [self._control.state]
 
     @property

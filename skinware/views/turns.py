@@ -20,6 +20,7 @@ from skinware.views.following import Newest, ShownDriver
 from skinware.views.live import places_of
 from skinware.views.plots import Plots
 from skinware.views.quantities import Quantity
+from skinware.views.recorded_plots import RecordedPlots
 from skinware.views.scene import Scene
 from skinware.views.shows import Show
 from skinware.views.tree import problem_of_all, problems_of, state_of, worst_first
@@ -66,7 +67,7 @@ class Viewer:
         self._exact: list[tuple[int, int]] = []
         self._asked = False
         self._questions: list[looks.Names] = []
-        self.plots = Plots(self._follower)
+        self.plots = RecordedPlots(self._follower, show.played) if show.played else Plots(self._follower)
         self._error: str | None = None
 
     def obey(self, operation: looks.Operation) -> bool:
@@ -142,6 +143,7 @@ class Viewer:
                 {
                     "number": block.number,
                     "of": block.of,
+                    "begins": block.begins,
                     "lines": block.lines,
                     "time_ns": blobs.add(block.time_ns, "<i8"),
                     "values": blobs.add(block.values, "<f8"),

@@ -10,7 +10,6 @@ import fcntl
 import socket
 import struct
 import time
-from collections import deque
 from typing import Literal
 from weakref import WeakKeyDictionary
 
@@ -19,101 +18,13 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.device_time import DeviceClock
 
 Stamps = npt.NDArray[np.int64]
 
-BLOCK_NS = 250_000_000
-"""The smallest difference within this time is one point of the lower edge."""
-BLOCKS = 40
-LEAST_BLOCKS = 4
-"""Before this many points, the two clocks are assumed to run equally fast."""
-LARGEST_DRIFT = 1e-3
-LARGEST_FALL_NS = 10_000_000
-"""A stamp this far below the line means that the controller's clock was set: no delay is negative."""
 LONGEST_DELAY_NS = 100_000_000
-"""A stamp this far off the line means that the controller's clock was set or restarted."""
-
-
-class HardwareClock:
-    """The clock of one controller.
-
-    Kernel stamp minus controller stamp is offset plus delay. A line is fitted to its lower edge, as no delay is
-    negative; stamps are put on that line, but at most ``LONGEST_DELAY_NS`` before the kernel's and never after it.
-    """
-
-    def __init__(self) -> None:
-        self._forget()
-
-    def _forget(self) -> None:
-        self._points: deque[tuple[int, int]] = deque(maxlen=BLOCKS)  # (hardware stamp, difference) at the lower edge
-        self._block_began_ns = 0
-        self._lowest: tuple[int, int] | None = None  # point of this block
-        self._drift = 0.0
-        self._edge = (0, 0)  # a point that the line goes through
-        self._last_ns = 0
-
-    def convert(self, hardware: Stamps, software: Stamps) -> Stamps:
-        """Return (n,) int64, CLOCK_MONOTONIC ns: when frames were on the wire.
-
-        Args:
-            hardware: (n,) int64, stamps of the controller, ns, in order; 0: none.
-            software: (n,) int64, stamps of the kernel, CLOCK_MONOTONIC ns; kept where the controller gave none.
-        """
-        known = np.flatnonzero(hardware)
-        if not len(known):
-            return software
-        stamps = software.copy()
-        # a line of its own for each part between two jumps of the controller's clock
-        steps, arrived = np.diff(hardware[known]), np.diff(software[known])
-        cuts = np.flatnonzero((steps < 0) | (np.abs(arrived - steps) > LONGEST_DELAY_NS)) + 1
-        for rows in np.split(known, cuts):
-            part = hardware[rows]
-            difference = software[rows] - part
-            if (self._points or self._lowest is not None) and not self._goes_on(part, difference):
-                self._forget()
-            self._learn(part, difference)
-            self._last_ns = int(part[-1])
-            # a frame is on the wire before the kernel has it
-            stamps[rows] = np.clip(part + self._line(part), software[rows] - LONGEST_DELAY_NS, software[rows])
-        return stamps
-
-    def _goes_on(self, hardware: Stamps, difference: Stamps) -> bool:
-        """Return whether stamps fit the known line. One that fits is enough: others may be delayed."""
-        if hardware[0] < self._last_ns:
-            return False
-        above = difference - self._line(hardware)
-        return bool(np.abs(above).min() < LONGEST_DELAY_NS and above.min() > -LARGEST_FALL_NS)
-
-    def _line(self, hardware: Stamps) -> Stamps:
-        at, offset = self._edge
-        line: Stamps = offset + np.rint((hardware - at) * self._drift).astype(np.int64)
-        return line
-
-    def _learn(self, hardware: Stamps, difference: Stamps) -> None:
-        if not self._points and self._lowest is None:
-            self._edge = int(hardware[0]), int(difference[0])
-        above = difference - self._line(hardware)
-        lowest = int(np.argmin(above))
-        point = int(hardware[lowest]), int(difference[lowest])
-        if above[lowest] < 0:
-            self._edge = point
-        if self._lowest is None:
-            self._block_began_ns, self._lowest = int(hardware[0]), point
-        elif point[1] - self._lowest[1] < (point[0] - self._lowest[0]) * self._drift:
-            self._lowest = point
-        if int(hardware[-1]) - self._block_began_ns >= BLOCK_NS:
-            self._points.append(self._lowest)
-            self._lowest = None
-            # fit the line to the lower edge: the median of all slopes between points, as low as the lowest point
-            at, offset = np.array(self._points, np.int64).T
-            x, y = (at - at[-1]).astype(np.float64), (offset - offset[-1]).astype(np.float64)
-            first, second = np.triu_indices(len(x), 1)
-            apart = x[second] > x[first]
-            if np.count_nonzero(apart) >= LEAST_BLOCKS * (LEAST_BLOCKS - 1) // 2:
-                slopes = (y[second] - y[first])[apart] / (x[second] - x[first])[apart]
-                self._drift = min(max(float(np.median(slopes)), -LARGEST_DRIFT), LARGEST_DRIFT)
-            self._edge = int(at[-1]), int(offset[-1] + np.floor((y - x * self._drift).min()))
-
+"""No frame had its stamp longer before the kernel had the frame."""
+_PART_NS, _JUMP_NS = 250_000_000, 10_000_000  # of the clock of a controller
 
 Stamping = Literal["auto", "hardware", "software"]
 
@@ -147,7 +58,7 @@ class Stamper:
 
     Software stamps are CLOCK_REALTIME. They are converted with an offset that is sampled at every poll, so that steps
     of that clock do no harm: a frame lies between two polls, and only one of the offsets before and after a step puts
-    it there. Hardware stamps are on the controller's clock, see :class:`HardwareClock`.
+    it there. Hardware stamps are on the controller's clock, which may be set or restarted at any time.
 
     Attributes:
         hardware: read the controller's stamps, too.
@@ -157,7 +68,7 @@ class Stamper:
 
     def __init__(self, hardware: bool = False) -> None:
         self.hardware = hardware
-        self._clock = HardwareClock()
+        self._clock = DeviceClock(1e-9, 1 << 62, part_ns=_PART_NS, jump_ns=_JUMP_NS)
         self.last_poll_ns = now_ns()
         self.offset_ns = _offset_now_ns()[0]
 
@@ -193,7 +104,19 @@ class Stamper:
         # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
         self.last_poll_ns = min(int(stamps[-1]), poll_ns)
         if self.hardware:
-            return self._clock.convert(control[:, _HARDWARE_WORD] * NS_PER_S + control[:, _HARDWARE_WORD + 1], stamps)
+            return self.by_controller(control[:, _HARDWARE_WORD] * NS_PER_S + control[:, _HARDWARE_WORD + 1], stamps)
+        return stamps
+
+    def by_controller(self, hardware: Stamps, software: Stamps) -> Stamps:
+        """Return (n,) int64, CLOCK_MONOTONIC ns: when frames were on the wire.
+
+        Args:
+            hardware: (n,) int64, stamps of the controller, ns, in order; 0: none.
+            software: (n,) int64, stamps of the kernel, CLOCK_MONOTONIC ns; kept where the controller gave none.
+        """
+        stamps, known = software.copy(), np.flatnonzero(hardware)
+        earliest_ns = software[known] - LONGEST_DELAY_NS
+        stamps[known] = np.maximum(self._clock.convert(hardware[known], software[known]), earliest_ns)
         return stamps
 
 

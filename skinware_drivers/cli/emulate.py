@@ -90,8 +90,7 @@ def command(
     from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import load_driver, make_bus
-    from skinware_drivers.virtual.events import JsonLinesLog
-    from skinware_drivers.virtual.hardware import load_emulator, medium_of
+    from skinware_drivers.virtual.hardware import JsonLinesLog, load_emulator, medium_of
 
     if parse_bus_name(bus_name).interface == "virtual":
         raise ConfigurationError(

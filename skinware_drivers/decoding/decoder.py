@@ -217,6 +217,7 @@ class Decoder:
     Attributes:
         samples: for each bus, some of the frames that could not be used.
         last_sequence: (n_modules,) int64, the last sequence number of each; -1: none yet.
+        module_flags: (n_modules,) uint8, status bits that status frames set for other modules.
         haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
         unknown_identifiers: (n_buses, 2048) int64, frames of each identifier of 11 bits that are of no module.
     """
@@ -231,16 +232,18 @@ class Decoder:
         self.state: SkinState = SkinState(self.tables)
         self.samples: list[Samples] = [Samples() for _ in layouts]
         self.last_sequence = np.full(structure.n_modules, NONE_YET, np.int64)
+        self.module_flags = np.zeros(structure.n_modules, np.uint8)
         self.haste = np.zeros(structure.n_patches, np.int64)
         self.device_stamps: DeviceStamps = DeviceStamps(self.compiled.frames, structure)
         shape = len(structure.buses), STANDARD_IDENTIFIERS
         self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(shape, np.int64)
 
     def forget(self, patch: int) -> None:
-        """Forget the sequence numbers, the rhythm and the clock of a patch that has restarted."""
+        """Forget the sequence numbers, the flags, the rhythm and the clock of a patch that has restarted."""
         self.device_stamps.forget(patch)
         modules = np.flatnonzero(self._module_patch == patch)
         self.last_sequence[modules] = NONE_YET
+        self.module_flags[modules] = 0
         for cycle in self.compiled.cycles:
             cycle.forget(modules)
 

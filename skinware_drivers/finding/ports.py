@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-from skinware_drivers.serial.opening import group_that_may
+from skinware_drivers.serial.ports import group_that_may
 
 SLOW_LATENCY_MS = 1
 """A latency timer above this holds data back: FTDI's default is 16 ms."""

@@ -12,7 +12,7 @@ from skinware.drivers import Drivers
 from skinware.errors import BusNotAvailable, ConfigurationError, NamespaceError
 from skinware.memory.namespace import ROOT, Namespace
 from skinware_drivers.bus_names import BusName, BusPlace
-from skinware_drivers.serial.opening import SerialOptions, find_port
+from skinware_drivers.serial.ports import SerialOptions, find_port
 
 _PREFIX = "skinware."
 _PRIVATE = "virtual"

@@ -27,7 +27,7 @@ from skinware_drivers.modbus.master import ANSWERS
 from skinware_drivers.modbus.registers import Order, Registers, Wanted
 from skinware_drivers.options import OptionsT
 from skinware_drivers.polling import ZeroWatch
-from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
+from skinware_drivers.serial.ports import DEFAULT_BAUDRATE
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -23,8 +23,7 @@ from skinware_drivers.modbus.registers import Order, Wanted
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.serial.opening import DEFAULT_BAUDRATE, SerialOptions, find_port, open_port
-from skinware_drivers.serial.ports import DescriptorPort, Port
+from skinware_drivers.serial.ports import DEFAULT_BAUDRATE, DescriptorPort, Port, SerialOptions, find_port, open_port
 from skinware_drivers.serial.stream import CHUNK
 from skinware_drivers.streams.bus import Address, parse_address
 from skinware_drivers.streams.tcp import TcpOptions, TcpPort, TcpServerBus, connect

@@ -13,6 +13,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.compiled import CompiledCycle
 from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.decoding.frame_kind import FrameKind
+from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import Above, Byte, Packed, Sentinel, SequenceNumber, StatusBytes
 from skinware_drivers.layout import Expand, Frame
 from skinware_drivers.native import structs
@@ -98,6 +99,8 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.first_group = arrays.of(np.searchsorted(structure.group_patch, np.arange(structure.n_patches)), np.int64)
     plan.patch_bus = arrays.of(structure.patch_bus, np.int64)
     plan.last_sequence, plan.haste = arrays.at(decoder.last_sequence), arrays.at(decoder.haste)
+    if any(frame.module_flags for frame in compiled.frames):
+        plan.module_flags = arrays.at(decoder.module_flags)
     plan.unknown_identifiers = arrays.at(decoder.unknown_identifiers)
 
     plan.values, plan.status = arrays.at(state.all_values), arrays.at(state.all_status)
@@ -169,10 +172,12 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         column += run.count
     kind.n_runs, kind.runs = arrays.structs(structs.Run, runs)
     values = decoder.tables.structure.dtype
-    if not isinstance(frame.values, Expand):
+    if frame.runs:
         dtypes = (np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs)
         values = np.result_type(*dtypes)
-    kind.n_flags, kind.flags = arrays.structs(structs.Flag, (_flag(flag, values, arrays) for flag in frame.flags))
+    kind.n_flags, kind.flags = arrays.structs(
+        structs.Flag, (_flag(flag, values, decoder.tables, arrays) for flag in frame.flags)
+    )
     bits, table = frame.module_byte, compiled.module_by_byte
     if bits is not None and bits.byte is not None and table is not None:
         kind.names_module, kind.key_byte, kind.key_shift = True, bits.byte, bits.shift
@@ -181,7 +186,7 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
     return kind
 
 
-def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.Flag:
+def _flag(flag: Any, values: np.dtype[Any], tables: SkinTables, arrays: structs.Arrays) -> structs.Flag:
     if isinstance(flag, Sentinel):
         return _compared(_SENTINEL, flag.status, flag.value, values)
     if isinstance(flag, Above):
@@ -191,6 +196,10 @@ def _flag(flag: Any, values: np.dtype[Any], arrays: structs.Arrays) -> structs.F
     dtype, is_swapped = _type(flag.dtype)
     n_each, each = arrays.structs(structs.ChannelBit, (structs.ChannelBit(*pair) for pair in flag.each))
     word = {"offset": flag.offset, "type": dtype, "is_swapped": is_swapped, "mask": flag.mask, "normal": flag.normal}
+    patches, keys = range(tables.structure.n_patches), flag.each_module
+    of_modules = (structs.ModuleBit(tables.module_key.get((p, key), -1), shift) for p in patches for key, shift in keys)
+    _, modules = arrays.structs(structs.ModuleBit, of_modules)
+    word |= {"n_modules": len(keys), "modules": modules}
     return structs.Flag(form=_WORD, status=int(flag.status), n_each=n_each, each=each, **word)
 
 

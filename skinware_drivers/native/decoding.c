@@ -167,6 +167,7 @@ void decode_batch(struct path *path)
         find_cycles(path, &plan->cycles[number], number);
     finish_updates(path, first);
     put_in_order(path, first);
+    add_module_flags(path, first);
     if (path->n_foreign)
         part_with(path, time_ns);
     put_back(path);

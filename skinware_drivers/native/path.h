@@ -56,9 +56,15 @@ struct channel_bit {
     int64_t channel, shift;
 };
 
+struct module_bit { /* module: -1 = the patch has none of this key */
+    int64_t module, shift;
+};
+
 struct flag { /* mask: of a word, or of the status bytes; normal: the word when nothing is to be told */
     int64_t form, status, offset, type, is_swapped, mask, normal, n_each;
     const struct channel_bit *each;
+    int64_t n_modules;
+    const struct module_bit *modules; /* (patches, n_modules) */
     int64_t is_float, integer; /* of a sentinel or a limit: how values are compared, and with what */
     double real;
 };
@@ -158,6 +164,7 @@ struct plan {
     const uint8_t *is_prompt;     /* (n_groups,) bool: in every period, so that frames wait for it */
     const int64_t *age_limit_ns;  /* (n_groups,) */
     int64_t *last_sequence;       /* (n_modules,) */
+    uint8_t *module_flags;        /* (n_modules,) status that frames of others set; NULL: no frame does */
     int64_t *haste;               /* (n_patches,) */
     int64_t *unknown_identifiers; /* (n_buses, 2048) */
     int64_t *sample_next_ns;      /* (n_buses, N_SAMPLE_KINDS): when a sample is wanted again */

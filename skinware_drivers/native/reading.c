@@ -185,6 +185,43 @@ static void apply_flags(const struct path *path, const struct kind *kind, int64_
     }
 }
 
+/* A frame with the status of other modules says which flags they have from now on. */
+static void flag_modules(const struct path *path, const struct kind *kind, int64_t module, int64_t row)
+{
+    const struct plan *plan = path->plan;
+    for (const struct flag *flag = kind->flags; flag < kind->flags + kind->n_flags; flag++) {
+        if (!flag->n_modules || length_of(path->batch, row) < flag->offset + bytes_of_type[flag->type])
+            continue;
+        uint64_t word = read_word(payload_of(path->batch, row) + flag->offset, flag->type, flag->is_swapped);
+        word ^= (uint64_t)flag->normal;
+        const struct module_bit *bit = flag->modules + plan->module_patch[module] * flag->n_modules;
+        for (const struct module_bit *end = bit + flag->n_modules; bit < end; bit++) {
+            if (bit->module < 0)
+                continue;
+            uint8_t *flags = &plan->module_flags[bit->module];
+            *flags = (uint8_t)((word >> bit->shift & 1) ? *flags | flag->status : *flags & ~flag->status);
+        }
+    }
+}
+
+/* Add the flags that frames of other modules set, up to each whole update from `first` on, in order of time. */
+void add_module_flags(struct path *path, int64_t first)
+{
+    const struct plan *plan = path->plan;
+    for (int64_t i = first; plan->module_flags && i < path->n_updates; i++) {
+        struct update *update = update_at(path, path->list[i]);
+        const struct kind *kind = &plan->kinds[path->kind[update->row]];
+        uint8_t *status = status_of(path, path->list[i]);
+        if (!update->whole)
+            continue;
+        flag_modules(path, kind, update->module, update->row);
+        for (int64_t value = 0; value < plan->width; value++) {
+            status[value] |= plan->module_flags[update->module];
+            update->is_flagged |= status[value] != 0;
+        }
+    }
+}
+
 /* Note which groups an update of a module belongs to. */
 void join_groups(const struct path *path, struct update *update, const struct assembly *assembly)
 {

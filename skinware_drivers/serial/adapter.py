@@ -16,7 +16,7 @@ from skinware_drivers.options import OptionsT
 from skinware_drivers.polling import Poll
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Encoding, Framing
-from skinware_drivers.serial.opening import DEFAULT_BAUDRATE
+from skinware_drivers.serial.ports import DEFAULT_BAUDRATE
 
 _BITS_PER_BYTE = 10
 

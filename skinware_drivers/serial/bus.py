@@ -16,10 +16,16 @@ from skinware_drivers.bus import FrameBatch, KernelBus
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.framing import Encoding, Framing, Unframed
-from skinware_drivers.serial.native_stream import NativeStream, stream_of
-from skinware_drivers.serial.opening import DEFAULT_BAUDRATE, SerialOptions, find_port, open_port
-from skinware_drivers.serial.ports import DescriptorPort, Port, PtyPort
-from skinware_drivers.serial.stream import CHUNK, Stream
+from skinware_drivers.serial.ports import (
+    DEFAULT_BAUDRATE,
+    DescriptorPort,
+    Port,
+    PtyPort,
+    SerialOptions,
+    find_port,
+    open_port,
+)
+from skinware_drivers.serial.stream import CHUNK, NativeStream, Stream, stream_of
 
 _MORE_WAITS = 2048  # a read that gave so much is followed by another
 _SPAN_NS = NS_PER_S

@@ -68,6 +68,7 @@ class Sum(Checksum):
 
     Attributes:
         width: in bits: 8, 16 or 32.
+        order: ``little`` (default): its lowest byte is sent first; or ``big``.
         init: initial value.
         negative: the sum is sent with its sign changed (two's complement), so that a whole frame adds up to 0.
     """
@@ -87,6 +88,7 @@ class Crc(Checksum):
 
     Attributes:
         width: 8 to 32 bits.
+        order: ``little`` (default): its lowest byte is sent first; or ``big``, as most catalogues write it.
         polynomial: without its highest bit.
         init: initial value.
         reflected_in: the lowest bit of each byte comes first.

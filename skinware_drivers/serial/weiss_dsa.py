@@ -34,7 +34,7 @@ from skinware_drivers.hand import PITCH_M, Grid, Hand
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.serial import Answers, Refused, Split
-from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
+from skinware_drivers.serial.weiss_wts import WeissAdapter, weiss_packet
 
 _DATA, _CONTROLLER, _SENSOR, _ACQUIRE, _MATRIX = 0x00, 0x01, 0x02, 0x03, 0x0B
 _ON, _RLE = 0x80, 0x01

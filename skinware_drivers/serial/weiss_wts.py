@@ -1,8 +1,9 @@
-"""Weiss Robotics' WTS tactile sensors, which report how many cells they have.
+"""Weiss Robotics' WTS tactile sensors, which report how many cells they have, and the protocol of that maker.
 
 Wire format: the programs wts_driver (github.com/ksatyaki/wts_driver) and wts_ft; where they contradict each other (byte
-order of the cells), the former. Frames: see :mod:`.weiss`; the CRC is over everything before it. Data come as command 0
-without a status: time in ms u32 LE, flags u8, cells u16 LE.
+order of the cells), the former. Frames: ``AA AA AA | command | length u16 LE | payload | CRC u16 LE``, with a CRC over
+everything before it that is in no catalogue. A response has the number of its command and begins with a status, u16 LE.
+Data come as command 0 without a status: time in ms u32 LE, flags u8, cells u16 LE.
 
 Not known: the payload of tare, which is sent empty unless the option ``tare_payload`` gives one; ksatyaki/wts_driver
 82c46ac (2016-09-01) declares tare and untare as one command with a truth value, and implements neither. The meaning of
@@ -13,19 +14,76 @@ device only, are not requested.
 from __future__ import annotations
 
 import struct
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import SensorType
-from skinware_drivers import Link, Module, Options, Patch, Sensor, operation
+from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
 from skinware_drivers.fields import Byte, DeviceTime, Identifier
 from skinware_drivers.layout import Frame, Layout, Values
-from skinware_drivers.serial import Answers, Refused
-from skinware_drivers.serial.weiss import WeissAdapter, weiss_packet
+from skinware_drivers.options import OptionsT
+from skinware_drivers.serial import CRC16_WEISS, Answers, Field, Length, Packet, Refused, SerialAdapter
+
+_AROUND = 8
+"""Bytes of a frame beside its payload."""
+
+
+def weiss_packet(most_payload: int, **more: Any) -> Packet:
+    """Return the framing of a device whose longest payload has so many bytes; ``more``: as of :class:`Packet`."""
+    return Packet(
+        sync=(0xAA, 0xAA, 0xAA),
+        length=Length(Field(4, 2), more=_AROUND),
+        maximum=_AROUND + most_payload,
+        checksum=CRC16_WEISS,
+        identifier=Field(3),
+        **more,
+    )
+
+
+class WeissAdapter(SerialAdapter[OptionsT]):
+    """One device, which reports its cells; :meth:`describe` keeps the report in ``_cells``."""
+
+    packet: ClassVar[Packet]
+    answers: ClassVar[Answers]
+    timeout_s: ClassVar[float]
+    tries: ClassVar[int]
+
+    def __init__(self, options: OptionsT) -> None:
+        super().__init__(options)
+        self._cells: Any = ()
+
+    @property
+    def payload_size(self) -> int:
+        """Bytes of the most cells; their number is known only after the device was asked."""
+        return -(-self.packet.maximum_body // 8) * 8
+
+    async def probe(self, link: Link, patch: Patch) -> bool:
+        """Return whether the same device answers: then it was reset, and no longer sends by itself."""
+        if await self._ask_cells(link, tries=1) == self._cells:
+            return True
+        self.tell(patch, Notice.CHANGED)
+        return False
+
+    @classmethod
+    @abstractmethod
+    async def _ask_cells(cls, link: Link, *, tries: int | None = None) -> Any:
+        """Ask for its cells."""
+
+    @classmethod
+    async def _ask(
+        cls, link: Link, command: int, arguments: bytes = b"", *, size: int = 0, tries: int | None = None
+    ) -> bytes:
+        """Send a command and return the answer behind its status."""
+        reply = await link.request(
+            command, arguments, Match(command), timeout_s=cls.timeout_s, tries=cls.tries if tries is None else tries
+        )
+        return cls.answers.result(command, reply.payload, size)
+
 
 _DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46, 0x50
 _HEADER = 5

@@ -13,8 +13,10 @@ from msgspec import Meta
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
+from skinware_drivers.bus import FrameBatch
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
 
 Resolved = tuple[socket.AddressFamily, tuple[str, int]]
@@ -128,7 +130,7 @@ class StreamBus(SerialBus):
     """A bus that programs or networks carry, with options of its own.
 
     Raises:
-        ConfigurationError: an option is unknown or has a bad value.
+        ConfigurationError: the channel names no place, or an option is unknown or has a bad value.
 
     Attributes:
         scheme: of its name, ``SCHEME://CHANNEL``.
@@ -142,6 +144,11 @@ class StreamBus(SerialBus):
     ) -> None:
         super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
         self._options: Any = options_from_strings(self.options_class, options or {})
+        self._place: Any = self._parse(channel)
+
+    def _parse(self, channel: str) -> Any:
+        """Return the place that the channel names, or raise ConfigurationError."""
+        raise NotImplementedError
 
     @property
     def name(self) -> str:
@@ -154,28 +161,65 @@ class StreamBus(SerialBus):
 
 
 class NetworkBus(StreamBus):
-    """A serial bus over a network.
-
-    Args:
-        channel: ``HOST:PORT``, in the form of its scheme.
-
-    Raises:
-        ConfigurationError: no such address, or an option is unknown or has a bad value.
-
-    Attributes:
-        needs_host: a host must be given.
-    """
+    """A serial bus over a network; its channel is ``HOST:PORT``, and ``needs_host`` says whether HOST may be empty."""
 
     needs_host: ClassVar[bool] = False
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self._address = self._parse(channel)
-
     def _parse(self, channel: str) -> Address:
         return parse_address(self.scheme, channel, needs_host=self.needs_host)
+
+
+class MessagePort(Port):
+    """A port from which Python reads messages.
+
+    Attributes:
+        dropped, refused: messages that were not used, since they were counted last.
+    """
+
+    dropped = refused = 0
+
+
+class MessageBus(StreamBus):
+    """A bus of messages that Python reads; ``most_messages``: of a take, before other buses get their turn."""
+
+    most_messages: ClassVar[int] = 1
+
+    @property
+    def reads_natively(self) -> bool:
+        return False
+
+    def receive(self, batch: FrameBatch, ordinal: int) -> int:
+        """Append the frames of the messages that have arrived, at most ``batch.free``.
+
+        Raises:
+            BusNotAvailable: the port cannot be used any more.
+        """
+        taken = 0
+        for _ in range(self.most_messages):
+            bytes_before = self.counters.framing.bytes_in
+            try:
+                taken += super().receive(batch, ordinal)
+            except BusNotAvailable:
+                if not taken:
+                    raise
+                self._stay_readable(True)  # the next take raises it again
+                break
+            if not batch.free or self.counters.framing.bytes_in == bytes_before:
+                break
+        return taken
+
+    def _read(self, port: Any) -> None:
+        """Read one message, never two as one."""
+        try:
+            if message := port.read(CHUNK):
+                self._hear(message, now_ns())
+        finally:
+            self._count(port)
+
+    def _count(self, port: MessagePort) -> None:
+        self.counters.dropped += port.dropped
+        self.counters.refused += port.refused
+        port.dropped = port.refused = 0
 
 
 class ServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -189,16 +233,11 @@ class ServerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = 5.0
 
 
-class ServerBus(StreamBus):
+class ServerBus(MessageBus):
     """A program that sends by itself, perhaps to others as well, and is only read."""
 
     options_class: ClassVar[type[msgspec.Struct]] = ServerOptions
     _heard_ns = 0
-
-    @property
-    def reads_natively(self) -> bool:
-        """False: the protocol is in Python."""
-        return False
 
     def open(self) -> None:
         """Connect.

@@ -30,8 +30,7 @@ from skinware_drivers.serial.checksums import CRC32
 from skinware_drivers.serial.framing import Field
 from skinware_drivers.serial.packets import Length, Packet
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import ServerBus, need_package
+from skinware_drivers.streams.bus import MessagePort, ServerBus, need_package
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -156,13 +155,12 @@ class _ReadSource:
     heard_ns: int
 
 
-class TopicPort(Port):
+class TopicPort(MessagePort):
     """Reads topics, and notes their publishers.
 
     Attributes:
         publishers: of all topics there, by handle.
-        dropped: samples so far that found no room.
-        refused: samples so far that were not used.
+        dropped: samples that found no room.
         news: of publishers since they were logged last.
     """
 
@@ -171,7 +169,6 @@ class TopicPort(Port):
     def __init__(self, topics: Sequence[DdsTopic]) -> None:
         self.topics = topics
         self.publishers: dict[Hashable, TopicSource] = {}
-        self.dropped = self.refused = 0
         self.news: list[News] = []
         self._sources: dict[str, _ReadSource] = {}
 
@@ -257,7 +254,8 @@ class TopicBus(ServerBus):
     def check(self) -> None:
         """Report publishers that cannot be read; that none sends is no reason to join again."""
         SerialBus.check(self)
-        self._report()
+        if self._port is not None and self._joined is not None:
+            self._count(self._joined)
 
     def heard(self) -> list[HeardTopic]:
         """Return the topics that are published there, as far as that is known."""
@@ -284,19 +282,9 @@ class TopicBus(ServerBus):
         self._joined = self._join(self.topics)
         return self._joined
 
-    def _read(self, port: Port) -> None:
-        if records := port.read(CHUNK):
-            self._hear(records, now_ns())
-        self._report()
-
-    def _report(self) -> None:
-        port = self._joined
-        if port is None or self._port is None:
-            return
+    def _count(self, port: Any) -> None:
+        super()._count(port)
         port.judge(now_ns())
-        self.counters.dropped += port.dropped
-        self.counters.refused += port.refused
-        port.dropped = port.refused = 0
         news, port.news = port.news, []
         for level, text in news:
             log.log(level, "%s: %s", self.name, text)
@@ -316,17 +304,15 @@ class DdsBus(TopicBus):
     options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
     device_end: ClassVar[Callable[..., Bus] | None] = _device_end
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self.domain: int = parse_domain(channel)
+    def _parse(self, channel: str) -> int:
+        domain = parse_domain(channel)
         need_package(self.name, *_PACKAGE)
+        return domain
 
     def _join(self, topics: Sequence[DdsTopic]) -> TopicPort:
         from skinware_drivers.streams.dds_ends import DdsPort
 
-        return DdsPort(self.name, self.domain, self._options, topics)
+        return DdsPort(self.name, self._place, self._options, topics)
 
 
 def parse_domain(channel: str, scheme: str = "dds") -> int:

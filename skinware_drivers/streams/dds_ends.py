@@ -163,8 +163,11 @@ class DdsDeviceBus(StreamBus):
     options_class: ClassVar[type[msgspec.Struct]] = DdsOptions
     topics: Sequence[DdsTopic] = ()
 
+    def _parse(self, channel: str) -> int:
+        return parse_domain(channel)
+
     def _open_port(self) -> Port:
-        return _PublishingPort(self.name, parse_domain(self.channel), self._options, self.topics)
+        return _PublishingPort(self.name, self._place, self._options, self.topics)
 
 
 class _PublishingPort(Port):

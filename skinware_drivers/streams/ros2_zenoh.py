@@ -57,14 +57,11 @@ class ZenohTopicBus(TopicBus):
     device_end: ClassVar[Callable[..., Bus] | None] = _no_device_end
     options_class: ClassVar[type[msgspec.Struct]] = ZenohOptions
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self.domain: int = parse_domain(channel, self.scheme)
+    def _parse(self, channel: str) -> int:
+        return parse_domain(channel, self.scheme)
 
     def _join(self, topics: Sequence[DdsTopic]) -> TopicPort:
-        return ZenohPort(self.name, self.domain, self._options, topics)
+        return ZenohPort(self.name, self._place, self._options, topics)
 
 
 def publisher_of(token: str) -> tuple[str, str]:

@@ -150,7 +150,7 @@ class TcpServerBus(NetworkBus):
     options_class: ClassVar[type[msgspec.Struct]] = TcpOptions
 
     def _open_port(self) -> Port:
-        return ListeningPort(self._address, self._options.patience_s)
+        return ListeningPort(self._place, self._options.patience_s)
 
 
 class TcpBus(NetworkBus):
@@ -165,7 +165,7 @@ class TcpBus(NetworkBus):
     device_end: ClassVar[Callable[..., Bus] | None] = TcpServerBus
 
     def _open_port(self) -> Port:
-        return TcpPort(f"tcp://{self._address}", connect(self._address), self._options.patience_s)
+        return TcpPort(f"tcp://{self._place}", connect(self._place), self._options.patience_s)
 
 
 def connect(address: Address) -> socket.socket:

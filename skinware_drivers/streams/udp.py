@@ -15,14 +15,10 @@ from msgspec import Meta
 
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import FrameBatch
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import Address, NetworkBus
+from skinware_drivers.streams.bus import Address, MessageBus, MessagePort, NetworkBus
 
 _RECEIVE_BUFFER = 1 << 20
-_MOST_DATAGRAMS = 512
-"""Datagrams of a take, before other buses get their turn."""
 _SILENT_NS = 2 * NS_PER_S
 _ANY_HOST = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
 
@@ -34,7 +30,7 @@ class UdpOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ] = None
 
 
-class UdpPort(Port):
+class UdpPort(MessagePort):
     """A socket for datagrams, and the one other end that is heard.
 
     Args:
@@ -42,7 +38,7 @@ class UdpPort(Port):
         local: port of this computer, if the other end is given.
 
     Attributes:
-        foreign: datagrams of other senders, which were dropped.
+        refused: datagrams of other senders.
         peer: the other end; None: none has sent yet.
 
     Raises:
@@ -52,7 +48,6 @@ class UdpPort(Port):
     longest_wait = 0
 
     def __init__(self, address: Address, local: int | None = None) -> None:
-        self.foreign = 0
         self.peer: tuple[str, int] | None = None
         self._may_change = not address.host
         self._heard_ns = -_SILENT_NS
@@ -88,7 +83,7 @@ class UdpPort(Port):
             except OSError as error:
                 raise BusNotAvailable(f"udp: {os.strerror(error.errno or 0)}") from None
             if not self._is_heard(sender[:2]):
-                self.foreign += 1
+                self.refused += 1
             elif data:
                 return data
 
@@ -116,7 +111,7 @@ class UdpPort(Port):
         return sender == self.peer
 
 
-class UdpBus(NetworkBus):
+class UdpBus(MessageBus, NetworkBus):
     """Datagrams to and from one other end. Its name is ``udp://HOST:PORT`` or ``udp://:PORT``, with ``?key=value``.
 
     With a host, datagrams go to that host and port, and only its datagrams are received. Without one, PORT is that of
@@ -131,42 +126,13 @@ class UdpBus(NetworkBus):
 
     scheme: ClassVar[str] = "udp"
     options_class: ClassVar[type[msgspec.Struct]] = UdpOptions
+    most_messages: ClassVar[int] = 512
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        if self._options.local and not self._address.host:
+    def _parse(self, channel: str) -> Address:
+        address = super()._parse(channel)
+        if self._options.local and not address.host:
             raise ConfigurationError(f"{self.name}: its port is that of this computer already; leave local out")
-        self._udp: UdpPort | None = None
-
-    @property
-    def reads_natively(self) -> bool:
-        """False: the sender of a datagram is examined in Python."""
-        return False
-
-    def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames of the datagrams that have arrived, at most ``batch.free``.
-
-        Raises:
-            BusNotAvailable: the socket cannot be used any more.
-        """
-        taken = 0
-        for _ in range(_MOST_DATAGRAMS):
-            bytes_before = self.counters.framing.bytes_in
-            taken += super().receive(batch, ordinal)
-            if not batch.free or self.counters.framing.bytes_in == bytes_before:
-                break
-        return taken
+        return address
 
     def _open_port(self) -> Port:
-        self._udp = UdpPort(self._address, self._options.local)
-        return self._udp
-
-    def _read(self, port: Port) -> None:
-        """Read one datagram, never two as one."""
-        if datagram := port.read(CHUNK):
-            self._hear(datagram, now_ns())
-        if self._udp is not None:
-            self.counters.refused += self._udp.foreign
-            self._udp.foreign = 0
+        return UdpPort(self._place, self._options.local)

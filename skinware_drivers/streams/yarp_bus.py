@@ -15,14 +15,13 @@ from typing import ClassVar
 import msgspec
 
 from skinware.errors import BusNotAvailable, ConfigurationError
-from skinware.realtime import now_ns
 from skinware.status import BusReason
 from skinware.yarp.carriers import READ, Carrier, unframed
 from skinware.yarp.names import DEFAULT_PORT, WHO, NameServer, configured_server, is_port_name
 from skinware_drivers.bus import Bus
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
-from skinware_drivers.streams.bus import Address, NetworkBus, ServerBus, ServerOptions, parse_address
+from skinware_drivers.streams.bus import Address, MessagePort, ServerBus, ServerOptions, StreamBus, parse_address
 from skinware_drivers.streams.tcp import ListeningPort, TcpPort, connect
 from skinware_drivers.streams.yarp_messages import BEGIN, message_size
 
@@ -182,27 +181,28 @@ def _size(heard: bytes) -> int:
     return _MOST_HEARD
 
 
-class YarpServerBus(NetworkBus):
+class YarpServerBus(StreamBus):
     """The device's end, for emulators: ``skin-emulate --bus yarp://HOST:PORT/NAME``. ``note`` shows the name server."""
 
     scheme: ClassVar[str] = "yarp"
     options_class: ClassVar[type[msgspec.Struct]] = ServerOptions
 
-    def _parse(self, channel: str) -> Address:
-        return split_channel(channel)[0] or Address("127.0.0.1", 0)
+    def _parse(self, channel: str) -> tuple[Address | None, str]:
+        return split_channel(channel)
 
     def _open_port(self) -> Port:
-        return ServedPort(self._address, split_channel(self.channel)[1], self._options.patience_s)
+        address, name = self._place
+        return ServedPort(address or Address("127.0.0.1", 0), name, self._options.patience_s)
 
 
-class YarpPort(TcpPort):
+class YarpPort(MessagePort, TcpPort):
     """A connection to a port that sends its messages to us; it reads whole messages.
 
     It uses the carrier ``fast_tcp``, never ``text``: a real port that sends vectors writes past a buffer when it is
     read in text, and its program dies (YARP 2.3.64 to 4.0.0, ``BufferedConnectionWriter``).
 
     Attributes:
-        passed_over: messages that were not used, because newer ones had come.
+        dropped: messages that were not used, because newer ones had come.
     """
 
     def __init__(self, name: str, address: Address, patience_s: int) -> None:
@@ -218,7 +218,6 @@ class YarpPort(TcpPort):
             connection.close()
             raise
         self._rest = b""
-        self.passed_over = 0
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
         """Return the messages that have come, at most about 64 KiB, and bytes that are no message.
@@ -243,7 +242,7 @@ class YarpPort(TcpPort):
         at = whole.rfind(BEGIN)
         if at < 0:
             return pile[-2 * CHUNK :]  # part of no message
-        self.passed_over += whole.count(BEGIN, 0, at)
+        self.dropped += whole.count(BEGIN, 0, at)
         return whole[at:] + rest
 
 
@@ -280,32 +279,23 @@ class YarpBus(ServerBus):
     scheme: ClassVar[str] = "yarp"
     device_end: ClassVar[Callable[..., Bus] | None] = YarpServerBus
 
-    def __init__(
-        self, channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
-    ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self._server, self._name = split_channel(channel)
+    def _parse(self, channel: str) -> tuple[Address | None, str]:
+        return split_channel(channel)
 
     def _open_port(self) -> Port:
-        server = NameServer(*(self._server or configured_server()))
+        place, name = self._place
+        server = NameServer(*(place or configured_server()))
         try:
-            contact = server.query(self._name)
+            contact = server.query(name)
         except OSError as error:
             raise BusNotAvailable(f"{self.name}: {error}") from None
         if contact is None:
-            raise BusNotAvailable(f"{self.name}: {server} knows no port {self._name}: does the robot's program run?")
+            raise BusNotAvailable(f"{self.name}: {server} knows no port {name}: does the robot's program run?")
         if contact.carrier not in _CARRIERS:
             raise BusNotAvailable(
                 f"{self.name}: the port is called by {contact.carrier}, not by tcp", reason=BusReason.FAILED
             )
         return YarpPort(f"yarp://{self.channel}", Address(contact.host, contact.port), self._options.patience_s)
-
-    def _read(self, port: Port) -> None:
-        if messages := port.read(CHUNK):
-            self._hear(messages, now_ns())
-        if isinstance(port, YarpPort):
-            self.counters.dropped += port.passed_over
-            port.passed_over = 0
 
 
 def _whole_messages(pile: bytes) -> tuple[bytes, bytes]:

@@ -13,10 +13,9 @@ import numpy.typing as npt
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.testing.waiting import defect
-from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.bus import VirtualCanBus, VirtualModbusBus, VirtualSerialBus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
-from skinware_drivers.virtual.line import VirtualModbusBus, VirtualSerialBus
 
 _LONGEST_HOLD = 2.5
 _BETWEEN = 6

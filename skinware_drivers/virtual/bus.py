@@ -1,22 +1,27 @@
-"""Run emulated hardware in the driver's own process: the bus ``virtual``."""
+"""The bus ``virtual``: an emulated CAN bus, serial line or Modbus line in the driver's own process."""
 
 from __future__ import annotations
 
 import struct
+from collections import deque
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError
 from skinware.geometry import Geometry
 from skinware.samples import Unused
-from skinware_drivers.bus import Bus, FrameBatch, wire_dtype
+from skinware_drivers.bus import Bus, FrameBatch, chosen_by, wire_dtype
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
+from skinware_drivers.modbus.bus import ModbusBus
+from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.operations import operation
 from skinware_drivers.options import options_from_strings
+from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.ports import Port
 from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock, Timer
 from skinware_drivers.virtual.hardware import (
     EmulatedHardware,
@@ -25,6 +30,7 @@ from skinware_drivers.virtual.hardware import (
     WireFrame,
     emulators_instead,
     load_emulator,
+    medium_of,
     put_away,
 )
 from skinware_drivers.virtual.stage import Stage
@@ -35,14 +41,11 @@ _AT_ONCE = 0
 _SHORTEST_SLEEP_NS = 4_000_000
 """Shortest time between two wake-ups, so that frames come together as from a USB interface."""
 _LONGEST_BACKLOG_NS = 1_000_000_000
-"""Frames that wait longer are dropped, as from a full receive buffer."""
+"""What waits longer is dropped, as from a full receive buffer."""
 
 
-class VirtualCanBus(Bus):
-    """Emulated hardware as a bus.
-
-    Frames are stamped with the time at which they went onto the emulated wire, and arrive in that order. Frames that
-    are not fetched for a second are dropped and counted in ``counters.dropped``.
+class EmulatedBus(Bus):
+    """A bus with emulated devices at the other end.
 
     Its name is ``virtual:NAME?key=value``, with an emulator as NAME (an entry point of the group
     ``skinware.emulators``; ``roboskin`` if empty) and the emulator's options.
@@ -51,13 +54,13 @@ class VirtualCanBus(Bus):
         payload_size: longest payload of the driver's frames; longer ones are counted as refused.
         listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.
-        clock: stamps the frames, and makes the timer behind ``fileno``.
+        clock: stamps what comes, and makes the timer behind ``fileno``.
 
     Raises:
         ConfigurationError: no such emulator, or an option is unknown or has a bad value.
     """
 
-    medium: ClassVar[str] = "can"
+    opens_slowly: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -69,35 +72,55 @@ class VirtualCanBus(Bus):
         hardware: EmulatedHardware | None = None,
         clock: Clock = REAL_CLOCK,
     ) -> None:
-        super().__init__(channel, options, payload_size=payload_size, listen_only=listen_only)
-        self._emulated = type(hardware).__name__
+        super().__init__(channel, payload_size=payload_size, listen_only=listen_only)
+        self._emulated = channel or (type(hardware).__name__ if hardware else DEFAULT_EMULATOR)
         if hardware is None:
-            self._emulated = channel or DEFAULT_EMULATOR
             emulator = load_emulator(self._emulated)
-            hardware = emulator(options_from_strings(emulator.Options, self.options))
-        self.hardware = hardware
-        self._wire = hardware.wire if isinstance(hardware, Stage) else None
-        self.bit_rate: int = self._wire.bit_rate if self._wire else 0
+            hardware = emulator(options_from_strings(emulator.Options, options or {}))
+        self.hardware: EmulatedHardware = hardware
         self._clock = clock
-        self._timer: Timer | None = None
-        self._pending: list[WireFrame] = []
-        self._due_ns: int | None = None
-        self._present = True
-        self._next_error: BusError | None = None
-
-    # Bus
+        self._is_away = False
 
     @property
     def name(self) -> str:
         return f"bus virtual:{self._emulated}"
 
+    def instead(self, medium: str) -> str:
+        return emulators_instead(medium) or super().instead(medium)
+
+    def vanish(self) -> None:
+        """Go away as an unplugged interface does: ``receive`` raises, and ``open`` until :meth:`come_back`."""
+        self._is_away = True
+
+    def come_back(self) -> None:
+        """End :meth:`vanish`. A driver that has not noticed it yet still gets the error once."""
+        self._is_away = False
+
+
+class VirtualCanBus(EmulatedBus):
+    """Emulated hardware as a CAN bus.
+
+    Frames are stamped with the time at which they went onto the emulated wire, and arrive in that order. Frames that
+    are not fetched for a second are dropped and counted in ``counters.dropped``.
+    """
+
+    medium: ClassVar[str] = "can"
+
+    def __init__(self, channel: str, options: dict[str, str] | None = None, **others: Any) -> None:
+        super().__init__(channel, options, **others)
+        self._wire = self.hardware.wire if isinstance(self.hardware, Stage) else None
+        self.bit_rate: int = self._wire.bit_rate if self._wire else 0
+        self._timer: Timer | None = None
+        self._pending: list[WireFrame] = []
+        self._due_ns: int | None = None
+        self._next_error: BusError | None = None
+
+    # Bus
+
     @classmethod
     def fits(cls, medium: str) -> bool:
         """Return whether a driver of CAN devices, or of a program that makes values, can use the bus."""
         return medium in ("can", "virtual")
-
-    def instead(self, medium: str) -> str:
-        return emulators_instead(medium) or super().instead(medium)
 
     def open(self) -> None:
         """Listen to the devices. The first call powers them up; frames sent before a later one are gone.
@@ -106,7 +129,7 @@ class VirtualCanBus(Bus):
             BusNotAvailable: after :meth:`vanish`, until :meth:`come_back`.
             PlatformError: this system has no timerfd.
         """
-        if not self._present:
+        if self._is_away:
             raise BusNotAvailable(f"{self.name}: the emulated interface is away")
         if self._timer is None:
             self._timer = self._clock.timer()
@@ -126,7 +149,7 @@ class VirtualCanBus(Bus):
         if self._next_error is not None:
             error, self._next_error = self._next_error, None
             raise error
-        if self._timer is None or not self._present:
+        if self._timer is None or self._is_away:
             raise BusNotAvailable(f"{self.name} is not open")
         now_ns = self._clock()
         if len(self._pending) < batch.free:
@@ -155,7 +178,7 @@ class VirtualCanBus(Bus):
             BusSendError: the bus is closed, away or only listens, or the payload is too long for it.
         """
         try:
-            self.may_send_by(self._timer if self._present else None)
+            self.may_send_by(None if self._is_away else self._timer)
             if len(payload) > self.payload_size:
                 raise BusSendError(f"{self.name}: {len(payload)} bytes of payload, in frames of {self.payload_size}")
         except BusSendError:
@@ -183,13 +206,8 @@ class VirtualCanBus(Bus):
         self._wake_at(_AT_ONCE)
 
     def vanish(self) -> None:
-        """Go away as an unplugged interface does: ``receive`` raises, and ``open`` until :meth:`come_back`."""
-        self._present = False
+        super().vanish()
         self.fail_next_receive(BusNotAvailable(f"{self.name}: the emulated interface went away"))
-
-    def come_back(self) -> None:
-        """End :meth:`vanish`. A driver that has not noticed it yet still gets the error once."""
-        self._present = True
 
     # Within
 
@@ -251,3 +269,99 @@ class PlacedCanBus(VirtualCanBus):
             ValueError: the numbers make no sense, or no taxel would feel it.
         """
         return self.hardware.press(Pressing.of(at_m, force_n, radius_m, seconds), self._clock())
+
+
+class EmulatedLine(EmulatedBus):
+    """A line; the payloads of its emulator's frames are the bytes, framing and all, and their identifier is 0."""
+
+    _end: EmulatedPort | None = None
+
+    def vanish(self) -> None:
+        super().vanish()
+        if self._end is not None:
+            self._end.vanish()
+
+    def _open_port(self) -> Port:
+        if self._is_away:
+            raise BusNotAvailable(f"{self.name}: the emulated line is away")
+        self._end = EmulatedPort(self.hardware, self._clock)
+        return self._end
+
+
+class VirtualSerialBus(EmulatedLine, SerialBus):
+    """Emulated serial devices as a bus, with a name as that of ``VirtualCanBus``."""
+
+
+class VirtualModbusBus(EmulatedLine, ModbusBus):
+    """Emulated Modbus devices as a bus, with a name as that of ``VirtualCanBus``."""
+
+    def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
+        """Return 0: it has no baud rate."""
+        return 0.0
+
+
+class EmulatedPort(Port):
+    """The host's end of a line with emulated devices at the other."""
+
+    def __init__(self, hardware: EmulatedHardware, clock: Clock) -> None:
+        self._hardware, self._clock, self._timer = hardware, clock, clock.timer()
+        self._unread: deque[WireFrame] = deque()
+        self._is_away = False
+        hardware.skip(clock())
+        self._wake_when_due()
+
+    def fileno(self) -> int:
+        return self._timer.fileno()
+
+    def read(self, size: int) -> bytes:
+        if self._is_away:
+            raise BusNotAvailable("the emulated line went away, perhaps unplugged")
+        now_ns = self._clock()
+        due_ns = self._hardware.next_due_ns()
+        if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
+            self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+        self._unread += self._hardware.emit(now_ns)
+        if getattr(self._hardware, "datagrams", False):
+            data = self._unread.popleft().payload if self._unread else b""
+        else:
+            data = b"".join(frame.payload for frame in self._unread)
+            self._unread = deque([WireFrame(0, 0, data[size:])] if len(data) > size else ())
+        self._wake_when_due()
+        return data[:size]
+
+    def write(self, data: bytes) -> int:
+        if self._is_away:
+            raise OSError("unplugged")
+        self._hardware.receive(0, data, self._clock())
+        self._wake_when_due()
+        return len(data)
+
+    def close(self) -> None:
+        self._timer.close()
+        put_away(self._hardware)
+
+    def vanish(self) -> None:
+        self._is_away = True
+        self._timer.wake_at(0)
+
+    def _wake_when_due(self) -> None:
+        self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
+
+
+def _class_of(channel: str, _options: object) -> type[Bus]:
+    emulator = load_emulator(channel or DEFAULT_EMULATOR)
+    kinds: dict[str, type[Bus]] = {"serial": VirtualSerialBus, "modbus": VirtualModbusBus}
+    has_places = isinstance(emulator, type) and issubclass(emulator, PlacedHardware)
+    return kinds.get(medium_of(emulator), PlacedCanBus if has_places else VirtualCanBus)
+
+
+@chosen_by(_class_of)
+def virtual_bus(
+    channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
+) -> Bus:
+    """Return the bus ``virtual``: CAN, a serial line or a Modbus line, as the devices need it.
+
+    Raises:
+        ConfigurationError: there is no such emulator, or an option is unknown or has a bad value.
+    """
+    return _class_of(channel, options)(channel, options, payload_size=payload_size, listen_only=listen_only)

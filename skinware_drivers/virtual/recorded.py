@@ -28,10 +28,9 @@ from skinware_drivers.modbus.wire import Message, TcpMessages, is_question
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.bus import EmulatedLine, EmulatedPort, VirtualCanBus
 from skinware_drivers.virtual.hand_clock import REAL_CLOCK, Clock
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.line import EmulatedLine, EmulatedPort
 from skinware_drivers.virtual.logs import LogFile, WireSource
 from skinware_drivers.virtual.recorded_wire import SENT, Note, RecordedWire
 

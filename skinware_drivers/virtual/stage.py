@@ -18,11 +18,9 @@ import numpy as np
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import check_identifier
 from skinware_drivers.options import HasOptions
-from skinware_drivers.virtual.device import DATA, Device, EmulatorOptions
-from skinware_drivers.virtual.events import Event, FrameDamage
-from skinware_drivers.virtual.hardware import EventLog, WireFrame
+from skinware_drivers.virtual.device import DATA, Device, EmulatorOptions, ForeignTraffic, Transmission, Wire
+from skinware_drivers.virtual.hardware import Event, EventLog, FrameDamage, WireFrame
 from skinware_drivers.virtual.physics import WORLD_NS, open_world
-from skinware_drivers.virtual.wire import ForeignTraffic, Transmission, Wire
 
 if TYPE_CHECKING:  # needs MuJoCo
     from skinware_drivers.virtual.physics.world import PhysicsWorld

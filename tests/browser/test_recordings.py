@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import pytest
 from playwright.sync_api import Page
 
+import skinware.recording
 from skinware.memory.namespace import Namespace
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
@@ -81,6 +83,44 @@ def test_a_link_leads_to_a_moment(address: str, open_page: OpenPage) -> None:
     until(page, "skin.outlines[0].samples?.length > 3")
 
 
+def test_a_plot_has_the_times_of_the_recording(address: str, recording: Path, open_page: OpenPage) -> None:
+    with skinware.recording.open(recording) as opened:
+        series = opened["sleeve"].read(type_name="pressure")
+    page = open_page(f"{address}#{RAW_SCALE}&t=1.000")
+    until(page, "skin.replays[0]?.time_s === 1")
+    x, y = places(page, [0])[0]
+    page.mouse.move(x, y)
+    until(page, "skin.hovered")
+    taxel = tell(page, "skin.hovered[1]")
+    page.keyboard.press("g")
+    line = "skin.plots[0]?.lines[0]"
+    until(page, f"{line}?.times.length > 20")  # nothing was played
+    found = tell(page, line)
+    assert np.allclose(np.array(found["times"]) / 1e9, series.time_s[: len(found["times"])], atol=1e-6)
+    assert np.allclose(found["values"], series.physical("pressure")[: len(found["values"]), taxel])
+    page.keyboard.press(" ")
+    until(page, "skin.replays[0].time_s > 1.2")
+    times = np.array(tell(page, f"{line}.times"))
+    assert (np.diff(times) > 0).all()
+    assert times.max() / 1e9 <= tell(page, "skin.replays[0].duration_s")
+
+
+def test_a_person_chooses_how_recordings_match(address: str, recording: Path, open_page: OpenPage) -> None:
+    Path("later.mcap").write_bytes(recording.read_bytes())
+    page = open_page(f"{address.partition('?')[0]}?recording=walk.mcap&recording=later.mcap#t=0.500,0.900")
+    until(page, "skin.replays.map(({ time_s }) => time_s).join() === '0.5,0.9'")
+    match = page.get_by_label("Match")
+    assert match.input_value() == "hand"
+    assert match.locator("option[value=mark]").is_disabled()  # there is none
+    match.select_option("day")
+    until(page, "Math.abs(skin.replays[1].time_s - 0.5) < 0.001")
+    match.blur()
+    assert match.input_value() == "day"
+    page.locator(role("replay")).get_by_role("slider").nth(1).press("Shift+End")
+    until(page, "skin.replays[1].time_s > 1")
+    until(page, "document.querySelector('label[title^=What] select').value === 'hand'")
+
+
 def test_dropped_files_are_found_or_asked_for(address: str, recording: Path, open_page: OpenPage) -> None:
     Path("again.mcap").write_bytes(recording.read_bytes())
     size = recording.stat().st_size
@@ -97,6 +137,5 @@ def test_dropped_files_are_found_or_asked_for(address: str, recording: Path, ope
     assert parse_qs(urlsplit(page.url).query)["recording"] == ["walk.mcap", "again.mcap"]
     assert tell(page, "skin.drivers.map(({ name }) => name)") == ["sleeve (walk)", "sleeve (again)"]
     sides = [tell(page, "a[0].map(p => skin.pixelOf(skin.drivers[a[1]].id, p)[0])", [0, 1, 5, 600], i) for i in (0, 1)]
-    left, right = sorted(sides)  # by the names of their drivers
-    assert max(left) < min(right)
+    assert max(sides[0]) < min(sides[1])  # in the order of the files
     assert not page.locator(role("record")).is_visible()

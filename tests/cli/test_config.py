@@ -17,7 +17,7 @@ from skinware_drivers.can import roboskin, roboskin_boards
 from skinware_drivers.cli.config import command
 from skinware_drivers.finding import running, without_driver
 from skinware_drivers.finding.running import RunningDriver, driver_on, running_drivers, same_bus
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from tests.finding.fakes import see_only
 from tests.sdk.driving import commands, driving, emulated
 

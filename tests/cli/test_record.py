@@ -37,7 +37,7 @@ KILLS = 3
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
 def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespace, number: int) -> None:
     file = tmp_path / "skin.mcap"
-    with running("skin-record", "-o", str(file)) as recorder:
+    with running("skin-record", str(file)) as recorder:
         ready = recorder.wait_for("ready")
         assert (ready["file"], ready["namespace"], ready["names"]) == (str(file), namespace.name, [])
         with publishing(FakeSkin("torso")) as skin:
@@ -186,6 +186,7 @@ def test_no_permission_is_one_line(tmp_path: Path) -> None:
         (["-o", "nowhere/x.mcap"], 2, "nowhere/x.mcap: No such file or directory"),
         (["-o", "/proc/x.mcap"], 2, "/proc/x.mcap: No such file or directory"),
         (["-o", "x.mcap", "to rso"], 2, "service name 'to rso'"),
+        (["x.mcap", "-o", "y.mcap"], 2, "one file is written, and 2 are given: y.mcap, x.mcap"),
         (["-o", "x.mcap", "--split", "much"], 2, "'much' is not a size"),
         (["-o", "x.mcap", "--last", "0"], 2, "'0' is not a time"),
         (["-o", "x.mcap", "--last", "5s", "--split", "1MB"], 2, "--last keeps the past in memory"),

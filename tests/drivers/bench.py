@@ -21,8 +21,8 @@ from skinware_drivers.link import Link
 from skinware_drivers.polling import Notice
 from skinware_drivers.virtual import Emulator
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import Event
 from skinware_drivers.virtual.hand_clock import MonotonicClock
+from skinware_drivers.virtual.hardware import Event
 from tests.specification.decoding import SpecifiedDecoder
 
 MS = 1_000_000

@@ -34,8 +34,7 @@ from skinware_drivers.virtual.devices.allegro_v5 import (
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
-from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.hardware import EmulatedHardware
+from skinware_drivers.virtual.hardware import EmulatedHardware, Event
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.driving import Chatter, commands, emulated, troubled

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from skinware_drivers.finding.ports import SerialPort, User, serial_ports
-from skinware_drivers.serial import opening
+from skinware_drivers.serial.ports import group_that_may
 from tests.finding.fakes import FakeMachine
 
 FTDI = {"manufacturer": "FTDI", "product": "FT232R USB UART"}
@@ -113,4 +113,4 @@ def test_the_group_is_one_whose_members_may_read_and_write(fake: FakeMachine, mo
     cases = [(0o660, 5, True), (0o640, 5, False), (0o660, 0, False)]
     for mode, group, is_group in cases:
         info[0], info[5] = 0o020000 | mode, group
-        assert (opening.group_that_may(os.stat_result(info)) is not None) == is_group
+        assert (group_that_may(os.stat_result(info)) is not None) == is_group

@@ -16,7 +16,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.finding import without_driver
 from skinware_drivers.finding.without_driver import carry_out
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import Chatter, commands, emulated, troubled
 
 MTB4 = {"type": "mtb4", "runs": "application", "firmware": "1.25.0", "protocol": "2.0"}

@@ -10,11 +10,15 @@ import pytest
 
 from skinware import DriverWriter, Status, Structure
 from skinware.errors import ConfigurationError, ServiceTimeout
-from skinware.learning.live import ChosenSensors, LiveImage, LiveTouch, Totals, points
+from skinware.learning.features import Totals, points
+from skinware.learning.images import LiveImage
+from skinware.learning.live import ChosenSensors, LiveTouch, TouchOptions
+from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
 from skinware.sensor_types import FORCE, PRESSURE, SensorType
 from skinware.skin_layout import SkinLayout
-from tests.tactile.skins import placed
+from skinware.tactile.contacts_service import ContactsWriter
+from tests.tactile.skins import AT_ONCE, placed
 
 MS = 1_000_000
 
@@ -166,6 +170,64 @@ def test_points_have_places_and_force_against_the_normal() -> None:
     assert np.allclose(found[:, 3:], -np.array([[2.0], [3.0]]) * geometry.normal[[4, 7]])
     unplaced = points(SkinLayout(("hand",), (hand(),)), np.ones(1), "pressure", np.array([4]))
     assert (unplaced == 0).all()
+
+
+def test_points_are_numbers_with_names() -> None:
+    layout = SkinLayout(("hand",), (hand(),))
+    totals = Totals(layout, "pressure", np.array([4, 7]), "point")
+    assert totals.names[5:8] == ("hand.thumb_tip.taxel_4.fz", "hand.index_tip.taxel_1.x", "hand.index_tip.taxel_1.y")
+    assert totals.of(np.array([2.0, 3.0])).shape == (12,)
+
+
+def test_newer_touch_is_waited_for_and_comes_once() -> None:
+    with DriverWriter("hand", hand(), rate_hz=2) as writer:
+        publish(writer, 1, now_ns())
+        with LiveTouch() as live, LiveTouch(when_stale="hold", max_age_s=0.0) as hold:
+            assert (live.newer(timeout_s=0.0).values == 1).all()
+            with pytest.raises(ServiceTimeout, match=r"no newer touch within 0\.01 s"):
+                live.newer(timeout_s=0.01)
+            later = threading.Timer(0.05, lambda: publish(writer, 2, now_ns()))
+            later.start()
+            assert (live.newer(timeout_s=10.0).values == 2).all()
+            later.join()
+            with pytest.raises(ServiceTimeout, match="too old"):
+                hold.newer(timeout_s=0.0)  # it holds nothing yet
+    with pytest.raises(ConfigurationError, match="before it was opened"):
+        live.newer(timeout_s=0.0)
+
+
+def test_contacts_come_with_the_touch_and_are_an_image(namespace: Namespace) -> None:
+    structure, begin_ns = hand(), now_ns()
+    with (
+        DriverWriter("hand", structure, rate_hz=50) as driver,
+        ContactsWriter(structure, driver="hand", tracking=AT_ONCE) as contacts,
+    ):
+        publish(driver, 1, begin_ns)
+        touched = np.zeros(15, bool)
+        options = TouchOptions(contacts_namespace=namespace.name, max_age_ms=9_000)
+        live = LiveImage(options.touch(with_contacts=True), 16, 32, lowest=0, highest=10, shows="contacts")
+        contacts.publish(np.full(15, 2.0), touched, begin_ns)
+        live.open()
+        image, touch = live.at(begin_ns)
+        assert touch.contacts is not None
+        assert (len(touch.contacts.contacts), image.max()) == (0, 0)
+        touched[[6, 7]] = True
+        contacts.publish(np.full(15, 2.0), touched, begin_ns + MS)
+        image, touch = live.at(begin_ns + MS)
+        assert touch.contacts is not None
+        assert touch.contacts.contacts.load.tolist() == [4.0]
+        assert sorted(set(image.ravel().tolist())) == [0, 102]  # 4 of 10, on those two taxels
+        live.close()
+        with LiveTouch(max_age_s=0.5, contacts_in=namespace) as strict:
+            publish(driver, 1, begin_ns + 1000 * MS)
+            with pytest.raises(ServiceTimeout, match=r"too old: contacts \(1\.00 s\)"):
+                strict.at(begin_ns + 1001 * MS)
+
+
+def test_options_are_checked() -> None:
+    TouchOptions().check()
+    with pytest.raises(ValueError, match="when_stale is 'wait': give one of raise, hold"):
+        TouchOptions(when_stale="wait").check()
 
 
 def test_a_live_image_shows_the_touch_of_its_moment() -> None:

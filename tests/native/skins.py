@@ -181,6 +181,17 @@ def _flags(draw: st.DrawFn, longest: int, n_channels: int) -> Sequence[AnyFlag]:
     return found
 
 
+@st.composite
+def _flag_of_modules(draw: st.DrawFn, status: Status, longest: int) -> Flag:
+    """A flag of other modules, one of which may not exist."""
+    dtype = draw(st.sampled_from(_UNSIGNED))
+    bits = 8 * np.dtype(dtype).itemsize
+    keys = draw(st.lists(st.integers(0, 3), min_size=1, max_size=4, unique=True))
+    each = [(key, draw(st.integers(0, bits - 1))) for key in keys]
+    normal = draw(st.sampled_from([0, (1 << bits) - 1]))
+    return Flag(status, draw(st.integers(0, longest)), dtype, normal=normal, each_module=each)
+
+
 # -- layouts ------------------------------------------------------------------------------------------------------
 
 
@@ -270,6 +281,10 @@ def bus_designs(
             values = draw(st.sampled_from(_EXPANDS))
         else:
             values = draw(_runs(dtype, shortest, own))
+        flags = [*draw(_flags(longest, n_channels))]
+        if not is_member and draw(st.booleans()):
+            flags.append(draw(_flag_of_modules(_STATUS[number - n_members], longest)))
+            values = draw(st.sampled_from([values, ()]))
         frames.append(
             Frame(
                 f"frame {number}",
@@ -278,7 +293,7 @@ def bus_designs(
                 values,
                 naming.patch,
                 naming.module,
-                draw(_flags(longest, n_channels)),
+                flags,
                 None if is_member and has_counter else draw(st.none() | _number(shortest, 2)),
                 time,
             )

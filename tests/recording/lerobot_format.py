@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import numpy.typing as npt
 import pyarrow
@@ -21,6 +22,7 @@ OF_ALL = {
     "task_index": "int64",
 }
 STATISTICS = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
+VIDEO_PLACE = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
@@ -30,7 +32,7 @@ class Read:
 
     Attributes:
         info: of ``info.json``.
-        features: (rows, ...) by name; of images lists of PNG bytes.
+        features: (rows, ...) by name; of images lists of PNG bytes, of videos (rows, height, width, 3) uint8.
         episodes: rows of ``meta/episodes``.
         tasks: by number.
         statistics: of ``stats.json``.
@@ -57,7 +59,8 @@ def read_dataset(folder: Path) -> Read:
     info = json.loads((folder / "meta/info.json").read_text())
     assert info["codebase_version"] == "v3.0"
     assert info["data_path"] == f"data/{PLACE}"
-    assert info["video_path"] is None
+    has_videos = any(told["dtype"] == "video" for told in info["features"].values())
+    assert info["video_path"] == (VIDEO_PLACE if has_videos else None)
     assert type(info["fps"]) is int
     assert info["splits"] == {"train": f"0:{info['total_episodes']}"}
     for name, dtype in OF_ALL.items():
@@ -127,8 +130,29 @@ def _rows(folder: Path, info: dict[str, Any], episodes: list[dict[str, Any]]) ->
         assert sum(episodes[number]["length"] for number in inside) == len(table)
         parts.append(table)
     table = pyarrow.concat_tables(parts)
-    assert table.schema.names == list(info["features"])
-    return {name: _feature(table, name, told) for name, told in info["features"].items()}
+    videos = [name for name, told in info["features"].items() if told["dtype"] == "video"]
+    assert table.schema.names == [name for name in info["features"] if name not in videos]
+    return {
+        name: _video(folder, name, info, episodes) if name in videos else _feature(table, name, told)
+        for name, told in info["features"].items()
+    }
+
+
+def _video(folder: Path, name: str, info: dict[str, Any], episodes: list[dict[str, Any]]) -> Any:
+    told, rows = info["features"][name], []
+    for row in episodes:
+        of = {what: row[f"videos/{name}/{what}"] for what in ("chunk_index", "file_index")}
+        with av.open(str(folder / VIDEO_PLACE.format(video_key=name, **of))) as file:
+            (stream,) = file.streams.video
+            assert (stream.codec.canonical_name, stream.average_rate) == (told["info"]["video.codec"], info["fps"])
+            frames = list(file.decode(stream))
+        first, last = (round(row[f"videos/{name}/{end}_timestamp"] * info["fps"]) for end in ("from", "to"))
+        assert last - first == row["length"]
+        times = [round((frame.time or 0.0) * info["fps"]) for frame in frames]
+        assert times == list(range(len(frames)))
+        rows += [frame.to_ndarray(format="rgb24") for frame in frames[first:last]]
+    assert np.shape(rows) == (info["total_frames"], *told["shape"])
+    return np.array(rows)
 
 
 def _feature(table: pyarrow.Table, name: str, told: dict[str, Any]) -> Any:
@@ -172,7 +196,7 @@ def _check_statistics(read: Read) -> None:
     assert set(read.statistics) == set(read.info["features"])
     for name, told in read.info["features"].items():
         assert set(read.statistics[name]) == STATISTICS
-        if told["dtype"] == "image":
+        if told["dtype"] in ("image", "video"):
             for of in (read.statistics[name], *(_of_episode(row, name) for row in read.episodes)):
                 assert {np.shape(of[what]) for what in STATISTICS - {"count"}} == {(3, 1, 1)}
                 assert 0 <= np.min(of["min"]) <= np.min(of["q50"]) <= np.max(of["max"]) <= 1

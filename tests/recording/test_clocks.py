@@ -13,9 +13,8 @@ import skinware.recording
 from skinware import Namespace
 from skinware.conversion.tables import TIME, RecordedSource
 from skinware.realtime import NS_PER_S
-from skinware.recording.clocks import Clocks, TimeAxis, read_clocks
 from skinware.recording.files import Past, Target
-from skinware.recording.recorder import Recorder
+from skinware.recording.recorder import Clocks, Recorder, TimeAxis, read_clocks
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin
 from tests.recording.rig import has, publish, recording, replaying

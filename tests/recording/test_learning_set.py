@@ -6,6 +6,7 @@ import contextlib
 import io
 import tracemalloc
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -190,6 +191,43 @@ def test_a_selection_has_what_was_asked_for(tmp_path: Path) -> None:
     assert np.array_equal(read.features[f"{TACTILE}arm.pressure"], physical(made.tables[1], "pressure")[newest, 20:])
     sensors = pyarrow.parquet.read_table(io.BytesIO((tmp_path / "set/meta/skin/arm.sensors.parquet").read_bytes()))
     assert set(sensors["patch"].to_pylist()) == {"board 8"}
+
+
+def test_a_row_has_the_nearest_sample(made: Made) -> None:
+    read = learn(made, LearningSet(resample="nearest"))
+    (table,) = made.tables
+    nearest = np.rint(np.arange(60) / 30 * 100).astype(int)
+    assert np.array_equal(read.features[f"{TACTILE}torso.pressure"], physical(table, "pressure")[nearest])
+    assert read.features[f"{TACTILE}torso.age"] == pytest.approx(np.arange(60) / 30 - nearest / 100, abs=1e-6)
+
+
+def test_values_between_samples_are_said_to_be(made: Made, tmp_path: Path) -> None:
+    read = learn(made, LearningSet(fps=40, resample="linear"))
+    (table,) = made.tables
+    before, share = np.divmod(np.arange(80) * 2.5, 1)
+    after = np.minimum(before + 1, 199).astype(int)
+    values = physical(table, "pressure")
+    expected = values[before.astype(int)] * (1 - share[:, np.newaxis]) + values[after] * share[:, np.newaxis]
+    assert np.allclose(read.features[f"{TACTILE}torso.pressure"], expected, atol=1e-3)
+    assert read.features[f"{TACTILE}torso.interpolated"] == pytest.approx(share, abs=1e-6)
+    status = status_of(table, "pressure")
+    both = status[before.astype(int)] | np.where(share[:, np.newaxis] > 0, status[after], 0)
+    assert np.array_equal(read.features[f"{TACTILE}torso.pressure_status"], both)
+    again = convert_to_learning_set([made.path], tmp_path / "again", LearningSet(40, resample="linear", form="points"))
+    assert again.notes == ["torso: 40 of 80 rows are interpolated"]
+    assert read_dataset(again.path).features[f"{TACTILE}interpolated"] == pytest.approx(share, abs=1e-6)
+    with pytest.raises(ConfigurationError, match="leave out --window"):
+        LearningSet(resample="linear", window=2)
+
+
+def test_nothing_is_interpolated_over_a_lost_sample(tmp_path: Path) -> None:
+    made = write(tmp_path / "walk.mcap", table_of("torso", fake_structure(1, 1), [*range(20), *range(25, 50)]))
+    read = learn(made, LearningSet(fps=80, resample="linear"))
+    share, time_s = read.features[f"{TACTILE}torso.interpolated"], read.features["timestamp"]
+    in_gap = (time_s > 0.19) & (time_s < 0.25)
+    assert in_gap.sum() > 3
+    assert not share[in_gap].any()
+    assert (share[~in_gap] > 0).mean() > 0.7
 
 
 # -- episodes -----------------------------------------------------------------------------------------------------
@@ -720,6 +758,19 @@ def test_touch_as_images_has_the_colours_of_its_values(made: Made) -> None:
     for row in (0, 17, 59):
         assert np.array_equal(np.asarray(Image.open(io.BytesIO(images[row]))), expected.of(values[row]))
     assert read.info["features"]["observation.images.touch"]["shape"] == [24, 48, 3]
+
+
+def test_images_as_videos_are_those_images_nearly(made: Made, tmp_path: Path) -> None:
+    intervals = [Interval(0, 1), Interval(1.2, 1.8)]
+    wanted = LearningSet(form="images", size=(48, 96), intervals=intervals)
+    exact = learn(made, wanted, selection=ONE_TYPE)
+    converted = convert_to_learning_set([made.path], tmp_path / "v", replace(wanted, video=True), ONE_TYPE)
+    videos = read_dataset(converted.path).features["observation.images.touch"]
+    images = [np.asarray(Image.open(io.BytesIO(png))) for png in exact.features["observation.images.touch"]]
+    assert np.abs(videos.astype(int) - np.array(images)).mean() < 12
+    with pytest.raises(ConfigurationError, match="videos of 95 x 48: give even sizes"):
+        convert_to_learning_set([made.path], tmp_path / "odd", replace(wanted, size=(48, 95), video=True), ONE_TYPE)
+    assert not (tmp_path / "odd").exists()
 
 
 def test_touch_as_points_has_places_and_forces(made: Made) -> None:

@@ -98,7 +98,7 @@ def test_seeking_shows_what_was_newest_then(file: Path) -> None:
         for time_s in [random.Random(3).uniform(0, 1.2) for _ in range(20)] + [0.0, 1e9, -5]:
             told = reader.call("seek", time_s=time_s)
             assert told["time_s"] == min(max(time_s, 0.0), told["duration_s"])
-            expected = newest([frame for frame in frames if frame[0] < told["time_s"]])
+            expected = newest([frame for frame in frames if frame[0] <= told["time_s"]])  # the last one, too
             state = there()
             assert {name: state[name] for name in expected} == expected
 
@@ -106,7 +106,7 @@ def test_seeking_shows_what_was_newest_then(file: Path) -> None:
 def test_playing_goes_on_from_there_without_a_gap(file: Path) -> None:
     frames = recorded(file)
     middle_s = frames[len(frames) // 2][0]
-    expected = [contents for time_s, service, contents in frames if service == "torso" and time_s >= middle_s]
+    expected = [contents for time_s, service, contents in frames if service == "torso" and time_s > middle_s]
     with controlling(file, stays=True) as control:
         control.call("seek", time_s=middle_s)
         with ServiceReader[Sample]("torso") as torso:

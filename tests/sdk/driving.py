@@ -19,8 +19,7 @@ from skinware_drivers.running.building import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+from skinware_drivers.virtual.hardware import EmulatedHardware, Event, WireFrame
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 

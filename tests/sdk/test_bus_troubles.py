@@ -16,7 +16,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.running import bus_line
 from skinware_drivers.testing.waiting import PATIENCE_S, wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")

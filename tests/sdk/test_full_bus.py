@@ -14,8 +14,8 @@ from skinware_drivers.can.roboskin_setup import BoardSetUp, warn_of_full_bus
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual import wire
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual import device
+from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated
 
 
@@ -30,8 +30,8 @@ class Answering(RoboskinDriver):
 def test_boards_that_find_no_room_are_not_taken_for_restarted(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(wire, "_BIT_NS", 20_000)  # a slow wire, so that the machine need not be fast
-    monkeypatch.setattr(wire, "_USUAL_NS", 2_600_000)
+    monkeypatch.setattr(device, "_BIT_NS", 20_000)  # a slow wire, so that the machine need not be fast
+    monkeypatch.setattr(device, "_USUAL_NS", 2_600_000)
     log: list[Event] = []
     boards = (1, 2, 3)
     bus = emulated(log, boards=boards, pattern="idle")

@@ -292,6 +292,36 @@ def test_a_word_that_tells_something_where_it_is_not_normal(word: int, flagged: 
     assert decoder.state.status.tolist() == [means[one_of] for one_of in flagged]
 
 
+FINGERS = Flag(Status.NOT_CONNECTED, 0, "<u2", normal=0x0300, each_module=[(key, 8 + key) for key in range(3)])
+
+
+def test_a_status_frame_flags_other_modules_until_the_next_one() -> None:
+    """Bit 8 + key is clear while the finger is connected, but for the third, which says the opposite."""
+    finger = Frame("finger", [Identifier(0x100, 0x7F0)], (1,), Values(0, "u1", 1), module=Bits(0, 4))
+    status = Frame("status", [Identifier(0x200)], (2, 3), flags=[FINGERS], module=0, period_s=1.0)
+    fingers = [(0x100 + key, bytes([7])) for key in range(3)]
+    modules = [Module(taxels(1, first_uid=key), key=key) for key in range(3)]
+
+    def after(*frames: tuple[int, bytes]) -> list[int]:
+        found: list[int] = decode(Layout([finger, status]), modules, "u1", frames).state.status.tolist()
+        return found
+
+    lost = int(Status.NOT_CONNECTED)
+    assert after(*fingers, (0x200, b"\0\1")) == [0, 0, 0]  # from their next update on
+    assert after((0x200, b"\0\1"), *fingers) == [0, lost, 0]
+    assert after((0x200, b"\0\4"), *fingers) == [lost, lost, lost]
+    assert after((0x200, b"\0\4"), *fingers, (0x200, b"\0\3"), *fingers[1:]) == [lost, 0, 0]
+    assert after((0x200, b"\0"), *fingers) == [0, 0, 0]  # of a wrong length
+
+
+def test_a_restarted_patch_has_no_flags_of_before() -> None:
+    status = Frame("status", [Identifier(0x200)], (2,), flags=[replace(FINGERS, normal=0)], module=0)
+    decoder = decode(Layout([status]), [Module(taxels(1))], "u1", [(0x200, b"\0\1")])
+    assert decoder.module_flags.tolist() == [int(Status.NOT_CONNECTED)]
+    decoder.forget(0)
+    assert decoder.module_flags.tolist() == [0]
+
+
 def test_a_status_byte_for_each_value_that_may_be_absent() -> None:
     mask = Status.NO_ACK | Status.SUSPECT
     frame = Frame("d", [Identifier(0x100)], (2, 4), Values(0, "u1", 2, to=(1, 0)), flags=[StatusBytes(2, mask)])
@@ -502,6 +532,12 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (
             lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", 1, normal=256)]),
             "bits of an unsigned word",
+        ),
+        (lambda: one((), flags=[Flag(Status.NO_ACK, 0, "u1", each_module=[(0, 8)])]), "bits of an unsigned word"),
+        (lambda: one((), flags=[Flag(Status.NO_ACK, 0, "u1", each_module=[(0, 1), (0, 2)])]), "there are several"),
+        (
+            lambda: Layout([replace(rows(1, 2)[0][0], flags=[FINGERS]), rows(1, 2)[0][1]], rows(1, 2)[1]),
+            "is shown by itself",
         ),
     ],
 )

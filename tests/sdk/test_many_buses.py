@@ -19,7 +19,7 @@ from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from tests.commands import running as running_command
 from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, read_until, troubled
 

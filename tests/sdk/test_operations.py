@@ -17,7 +17,7 @@ from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 
 pytestmark = pytest.mark.usefixtures("hurry")

@@ -12,7 +12,7 @@ from skinware_drivers.can import roboskin, roboskin_boards
 from skinware_drivers.can.roboskin_options import Kind
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from tests.sdk.conftest import HURRIED_WAIT_S

@@ -10,7 +10,7 @@ from skinware import DriverReader, PatchState
 from skinware.errors import ConfigurationError, RequestFailed
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.sdk.test_roboskin_wire import MS, Rig, halves
 

@@ -14,7 +14,7 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.can.roboskin_setup import BoardSetUp
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from skinware_drivers.virtual.roboskin.boards import EmulatedBoard
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.virtual.rig import Rig

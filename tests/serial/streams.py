@@ -16,8 +16,8 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.serial.delimited import LINES, Delimited
 from skinware_drivers.serial.framing import Framed, Framer, Framing
 from skinware_drivers.serial.framings import Recurring, TextMatrix
-from skinware_drivers.serial.native_stream import NativeStream
 from skinware_drivers.serial.packets import Packet
+from skinware_drivers.serial.stream import NativeStream
 from tests.serial.framings import Example
 from tests.specification.path_tests import made
 

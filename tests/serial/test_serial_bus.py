@@ -17,7 +17,7 @@ from skinware.realtime import now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.registry import make_bus
-from skinware_drivers.serial import native_stream
+from skinware_drivers.serial import stream
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Unframed
@@ -30,7 +30,7 @@ from tests.serial.lines import ASK, DATA, FRAMING, data_frame, is_readable, line
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which kind of stream finds frames."""
     if request.param == "python":
-        monkeypatch.setattr(native_stream, "can_compile", lambda _: False)
+        monkeypatch.setattr(stream, "can_compile", lambda _: False)
 
 
 PACKETS = Packet(

@@ -19,7 +19,7 @@ from serial.tools import list_ports
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.status import BusReason
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.serial import opening
+from skinware_drivers.serial import ports
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import ThreadedPort
 from skinware_drivers.testing.waiting import wait_until
@@ -139,7 +139,7 @@ def test_nobody_is_told_to_join_the_group_root(
 
     info = os.stat_result((0o020000 | mode, 1, 1, 1, 0, group, 0, 0, 0, 0))
     monkeypatch.setattr(serial.Serial, "open", refuse)
-    monkeypatch.setattr(opening, "os", SimpleNamespace(**{**vars(os), "stat": lambda _path: info}))
+    monkeypatch.setattr(ports, "os", SimpleNamespace(**{**vars(os), "stat": lambda _path: info}))
     with pytest.raises(BusNotAvailable) as raised:
         SerialBus("/dev/ttyS9").open()
     assert words in str(raised.value)

@@ -19,7 +19,7 @@ from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
 from skinware_drivers.decoding.decoder import NONE_YET, PATCH_COUNTERS, Decoder, SkinState, Updates, read_numbers
 from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.description import SkinTables
-from skinware_drivers.fields import Byte, SequenceNumber
+from skinware_drivers.fields import Byte, Flag, SequenceNumber
 from skinware_drivers.layout import Layout
 from tests.specification.pairing import Pairing
 from tests.specification.reading import name_modules, read_updates
@@ -166,12 +166,32 @@ class SpecifiedDecoder(Decoder):
             nothing = Updates(none, groups, none > 0, empty, empty, empty.astype(np.uint8), none, none, False)
             return nothing, foreign + first
         updates = join([part for part, _ in parts])
-        newest_ns = updates.newest_ns
-        if len(parts) > 1:
-            updates = updates.take(np.lexsort((np.concatenate([rows for _, rows in parts]), newest_ns)))
-        elif (newest_ns[1:] < newest_ns[:-1]).any():
-            updates = updates.take(np.argsort(newest_ns, kind="stable"))
+        newest_ns, rows = updates.newest_ns, np.concatenate([rows for _, rows in parts])
+        order = np.lexsort((rows, newest_ns)) if len(parts) > 1 else np.argsort(newest_ns, kind="stable")
+        updates = updates.take(order)
+        self._add_module_flags(updates, kind, batch.wire[first:last], rows[order])
         return updates, foreign + first
+
+    def _add_module_flags(self, updates: Updates, kind: Bytes, wire: npt.NDArray[np.void], rows: Indices) -> None:
+        if not any(frame.module_flags for frame in self.compiled.frames):
+            return
+        for number, row in enumerate(rows.tolist()):
+            module = int(updates.module[number])
+            if updates.whole[number]:
+                for flag in self.compiled.frames[kind[row]].module_flags:
+                    end = flag.offset + np.dtype(flag.dtype).itemsize
+                    if wire["length"][row] >= end:
+                        word = int(wire["payload"][row, flag.offset : end].view(flag.dtype)[0]) ^ flag.normal
+                        self._flag_modules(flag, word, int(self._module_patch[module]))
+                updates.status[number] |= self.module_flags[module]
+        updates.flagged |= bool(updates.status.any())
+
+    def _flag_modules(self, flag: Flag, word: int, patch: int) -> None:
+        for key, bit in flag.each_module:
+            module = self.tables.module_key.get((patch, key))
+            if module is not None:
+                others = int(self.module_flags[module]) & ~int(flag.status)
+                self.module_flags[module] = others | (int(flag.status) if word >> bit & 1 else 0)
 
     def name(self, batch: FrameBatch) -> tuple[Indices, Bytes, Indices]:
         """Find the module and the kind of the frames of a batch, and count wrong frames.

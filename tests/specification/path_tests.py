@@ -14,8 +14,7 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters, FramerCounters
 from skinware_drivers.serial import bus
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.native_stream import NativeStream, can_compile
-from skinware_drivers.serial.stream import PythonStream, Stream
+from skinware_drivers.serial.stream import NativeStream, PythonStream, Stream, can_compile
 from skinware_drivers.testing import conformance
 from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.rig import Running, Suite, play

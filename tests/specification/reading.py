@@ -80,6 +80,8 @@ def _read(kind: FrameKind, payload: Bytes) -> npt.NDArray[Any]:
         payload: (n, size) uint8.
     """
     runs = [_read_run(run, payload) for run in kind.frame.runs]
+    if not runs:
+        return payload[:, :0]
     return runs[0] if len(runs) == 1 else np.concatenate(runs, axis=1)
 
 

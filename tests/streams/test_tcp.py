@@ -13,7 +13,7 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import BusName, parse_bus_name
 from skinware_drivers.registry import make_bus
-from skinware_drivers.serial import native_stream
+from skinware_drivers.serial import stream
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Unframed
 from skinware_drivers.serial.stream import CHUNK
@@ -27,7 +27,7 @@ from tests.streams.peers import LOCAL, free_port, opened, server
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which kind of stream finds frames."""
     if request.param == "python":
-        monkeypatch.setattr(native_stream, "can_compile", lambda _: False)
+        monkeypatch.setattr(stream, "can_compile", lambda _: False)
 
 
 def send_until_refused(bus: SerialBus) -> int:

@@ -23,7 +23,7 @@ from skinware.tactile.chain import ChainSettings
 from skinware.tactile.chain_state import default_path, read_state, save_state
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
-from tests.commands import BIN, run, running
+from tests.commands import BIN, refused, run, running
 from tests.tactile.reading import read_until
 
 
@@ -188,6 +188,18 @@ def test_it_waits_for_a_driver_that_is_not_there_and_says_so() -> None:
             assert status["ready"] == {"pressure": 0}
         assert calm.stop()["event"] == "stopped"
         assert calm.process.returncode == 0
+
+
+@pytest.mark.thorough
+def test_it_needs_no_name_where_one_driver_runs() -> None:
+    with publishing(idle(FakeSkin())):
+        with running("skin-calm", "--into", into()) as calm:
+            assert calm.wait_for("ready")["name"] == "fake"
+        with publishing(FakeSkin("torso")):
+            done = refused("skin-calm", "--into", into())
+    assert (done.returncode, "choose one with skin-calm NAME: fake, torso" in done.stderr) == (2, True)
+    done = refused("skin-calm", "--into", into())
+    assert (done.returncode, "no driver runs in namespace" in done.stderr) == (1, True)
 
 
 def test_what_was_learned_is_there_after_a_restart(tmp_path: Path) -> None:

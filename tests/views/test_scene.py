@@ -160,16 +160,17 @@ def a_hand(
 
 
 @pytest.mark.parametrize("frame", [None, "palm"], ids=["nominal", "measured"])
-def test_two_hands_lie_beside_each_other_in_any_order_of_start(frame: str | None) -> None:
+def test_two_hands_lie_beside_each_other_in_their_order(frame: str | None) -> None:
     """In the nominal frame a right and a left one; in another frame two of one model, which have the same places."""
-    hands = {"right": a_hand("right", frame), "left": a_hand("right" if frame else "left", frame)}
+    hands = {"left": a_hand("right" if frame else "left", frame), "right": a_hand("right", frame)}
     scene = scene_of(**hands)
     left, right = (scene.of(name, "pressure").position for name in ("left", "right"))
     assert right[:, 0].min() - left[:, 0].max() > 0.1 * np.ptp(left[:, 0])
     assert np.allclose(np.ptp(left, axis=0), np.ptp(right, axis=0))
     other_way = scene_of(**dict(reversed(hands.items())))
-    for name in hands:
-        assert np.array_equal(other_way.of(name, "pressure").position, scene.of(name, "pressure").position)
+    assert (
+        other_way.of("left", "pressure").position[:, 0].min() > other_way.of("right", "pressure").position[:, 0].max()
+    )
     geometry = hands["right"].geometry
     assert geometry is not None
     moved = geometry.position_m + scene.pose("right", frame or "right_hand_nominal")[:3, 3]  # as contacts are

@@ -20,7 +20,10 @@ from skinware.realtime import now_ns
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
 from skinware.tactile.contacts_service import ContactsWriter
+from skinware.views import recorded_plots
 from skinware.views.following import Follower, Origin
+from skinware.views.looks import Line
+from skinware.views.recorded_plots import RecordedPlots
 from skinware.views.shows import Outline, PlayedRecording, RecordingFiles, Show
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
@@ -139,6 +142,51 @@ def test_each_viewer_plays_for_itself_and_leaves_nothing(serving: Serve, recordi
             assert page.replays[0]["time_s"] == 0.5
             assert len(namespaces()) == 2
         wait_until(lambda: not namespaces())
+
+
+def test_plots_are_of_the_recording_whatever_was_played(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorded_plots, "_BEFORE_S", 0.5)
+    monkeypatch.setattr(recorded_plots, "_AHEAD_S", 0.2)
+    played = PlayedRecording(recording, "walk")
+    follower = Follower(Origin(played.namespace, recording="walk"))
+    lines = RecordedPlots(follower, [played])
+    found: dict[int, tuple[float, float]] = {}
+    loads: set[float] = set()
+
+    def has_read(first_s: float, last_s: float) -> bool:
+        follower.take(0)
+        lines.take()
+        for block in lines.blocks():
+            if block.of == "driver":
+                if block.begins:
+                    found.clear()
+                found.update(zip(block.time_ns.tolist(), map(tuple, block.values.tolist()), strict=True))
+            else:
+                assert block.of == "contacts"
+                loads.update(block.values.ravel().tolist())
+        return bool(found) and min(found) <= round(first_s * 1e9) and round(last_s * 1e9) <= max(found)
+
+    with closing(Show(follower, [played])), skinware.recording.open(recording) as opened, closing(lines):
+        played.act("seek", 1.0, pytest.fail)  # contacts are there then
+        wait_until(lambda: follower.take(0) is not None and follower.origins[0].contacts_reader("torso") is not None)
+        chosen = [Line(0, position=3), Line(0, type="pressure", modules=(1,)), Line(0, contact=1)]
+        lines.choose(1, chosen, follower.edition)
+        series = opened["torso"].read(type_name="pressure")
+        times = series.time_s
+        for now_s, first_s, last_s in (
+            (0.0, 0.0, 0.2),
+            (0.15, 0.0, 0.35),
+            (1.4, 0.9, opened.duration_s),
+            (0.9, 0.4, 1.1),
+        ):
+            played.act("seek", now_s, pytest.fail)
+            wait_until(lambda now_s=now_s: played.state["time_s"] == now_s)  # type: ignore[misc]
+            within = (times >= first_s) & ((times < last_s) | (last_s == opened.duration_s))
+            wait_until(lambda ends=times[within]: has_read(ends[0], ends[-1]))  # type: ignore[misc]
+            values = series.physical("pressure")[within]
+            assert [one for one, _ in found.values()][-len(values) :] == pytest.approx(values[:, 3].tolist())
+            assert list(found.values())[-1][1] == pytest.approx(values[-1, 10:20].sum())
+    assert loads == {60.0}
 
 
 def test_two_beside_each_other_are_two_bodies(serving: Serve, recording: Path) -> None:

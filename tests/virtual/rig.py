@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from skinware_drivers.virtual.events import Event, EventName
-from skinware_drivers.virtual.hardware import WireFrame
+from skinware_drivers.virtual.hardware import Event, EventName, WireFrame
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin.touch import WireSource

@@ -11,8 +11,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
-from skinware_drivers.virtual.events import Event
-from skinware_drivers.virtual.hardware import WireFrame, load_emulator
+from skinware_drivers.virtual.hardware import Event, WireFrame, load_emulator
 
 from .rig import MS, START_NS
 

@@ -9,8 +9,7 @@ import msgspec
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.virtual.events import Event, JsonLinesLog
-from skinware_drivers.virtual.hardware import WireFrame
+from skinware_drivers.virtual.hardware import Event, JsonLinesLog, WireFrame
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 

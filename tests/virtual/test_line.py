@@ -21,12 +21,10 @@ from skinware_drivers.virtual import (
     SerialEmulator,
     SerialEmulatorOptions,
     cut_packets,
-    line,
     on_a_grid,
 )
-from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.bus import VirtualCanBus, VirtualSerialBus, virtual_bus
 from skinware_drivers.virtual.hardware import EMULATORS, load_emulator, medium_of
-from skinware_drivers.virtual.line import VirtualSerialBus
 
 
 class Strip(SerialEmulator[SerialEmulatorOptions]):
@@ -69,8 +67,8 @@ def received(bus: VirtualSerialBus | VirtualCanBus, payload_size: int) -> list[t
 
 
 def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
-    bus = line.virtual_bus("strip", {"seed": "1"}, payload_size=8)
+    monkeypatch.setattr("skinware_drivers.virtual.bus.load_emulator", lambda _name: Strip)
+    bus = virtual_bus("strip", {"seed": "1"}, payload_size=8)
     assert isinstance(bus, VirtualSerialBus)
     bus.use(Packet(sync=(0xAA,), length=3), Packet(length=1, sync=(ord("?"),)))
     assert bus.name == "bus virtual:strip"
@@ -85,9 +83,9 @@ def test_packets_come_out_of_the_bytes_of_an_emulated_line(monkeypatch: pytest.M
 
 
 def test_options_of_the_emulator_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line, "load_emulator", lambda _name: Strip)
+    monkeypatch.setattr("skinware_drivers.virtual.bus.load_emulator", lambda _name: Strip)
     with pytest.raises(ConfigurationError, match="unknown option 'sed'; did you mean 'seed'"):
-        line.virtual_bus("strip", {"sed": "1"})
+        virtual_bus("strip", {"sed": "1"})
 
 
 def test_frames_of_a_program_have_any_length() -> None:
@@ -101,8 +99,8 @@ def test_frames_of_a_program_have_any_length() -> None:
 
 
 def test_devices_of_can_are_on_can() -> None:
-    assert isinstance(line.virtual_bus("xela"), VirtualCanBus)
-    assert isinstance(line.virtual_bus(""), VirtualCanBus)
+    assert isinstance(virtual_bus("xela"), VirtualCanBus)
+    assert isinstance(virtual_bus(""), VirtualCanBus)
 
 
 def test_every_driver_has_an_emulator_of_its_medium() -> None:

@@ -13,9 +13,8 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions as DriverOptions
 from skinware_drivers.description import assemble
-from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus
+from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus, virtual_bus
 from skinware_drivers.virtual.hardware import PlacedHardware, Pressing
-from skinware_drivers.virtual.line import virtual_bus
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 
 from .rig import START_NS, Rig

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from skinware_drivers.virtual.device import Transmission, Wire, frame_time_ns
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.wire import Transmission, Wire, frame_time_ns
 
 from .rig import MS, START_NS, Rig, cycles, is_data
 

@@ -6,8 +6,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
+from skinware.conversion import Selection
 from skinware.conversion.learning import Interval, Join, LearningSet, convert_to_learning_set
+from skinware.learning.images import Colours, TouchImage, range_of
+from skinware.skin_layout import SkinLayout
 from tests.cli.fake_skin import fake_structure
 from tests.recording.made import START_NS
 from tests.recording.test_learning_set import Made, physical, status_of, table_of, write, write_images
@@ -36,12 +40,25 @@ def main() -> None:
         "episodes": ([one, two], LearningSet(fps=25, intervals=intervals)),
         "camera": ([one], LearningSet(fps=25, joins=[camera], at=camera.feature)),
     }
+    touch = LearningSet(fps=25, form="images", size=(48, 96), video=True)
+    convert_to_learning_set([one.path], folder / "videos", touch, Selection(types=["pressure"]))
+    np.save(folder / "videos.npy", touch_images(one, range(0, FRAMES, 4)))
     for name, (made, wanted) in sets.items():
         convert_to_learning_set([each.path for each in made], folder / name, wanted)
     first = {"plain": [0], "windows": [3, 3], "episodes": [50, 200], "camera": [0]}
     length = {"plain": [100], "windows": [100, 100], "episodes": [25, 38], "camera": [60]}
     for name, (made, wanted) in sets.items():
         expected(folder / f"{name}.npz", made, wanted.window, first[name], length[name])
+
+
+def touch_images(made: Made, numbers: range) -> npt.NDArray[np.uint8]:
+    structure = made.tables[0].structure
+    assert structure is not None
+    layout = SkinLayout(("torso",), (structure,))
+    colours = Colours("grey", *range_of(layout, "pressure"))
+    image = TouchImage(layout, "pressure", np.arange(len(layout.uids("pressure"))), 48, 96, colours)
+    good = np.where(status_of(made.tables[0], "pressure") == 0, physical(made.tables[0], "pressure"), 0)
+    return np.array([image.of(good[number]) for number in numbers])
 
 
 def expected(path: Path, made: list[Made], window: int, first: list[int], length: list[int]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from lerobot_camera_skinware.configuration import SkinwareCameraConfig
 from skinware import Skin
 from skinware.errors import ServiceTimeout
-from skinware.learning.live import ChosenSensors, LiveImage, LiveTouch
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.learning import LiveImage, TouchSample
+from skinware.realtime import now_ns
 
 Image = npt.NDArray[np.uint8]
 
@@ -35,25 +36,18 @@ class SkinwareCamera(Camera):
         super().__init__(config)
         self.config = config
         self.is_held, self.off_s = False, 0.0
-        touch = LiveTouch(
-            ChosenSensors(config.type_name, tuple(config.modules), config.regions or None),
-            drivers=[config.driver] if config.driver else None,
-            namespace=config.namespace or None,
-            max_age_s=None if config.max_age_ms is None else config.max_age_ms / 1000,
-            when_stale="hold" if config.when_stale == "hold" else "raise",
-        )
         x, y = config.tangential
         self._live = LiveImage(
-            touch,
+            config.touch(with_contacts=config.shows == "contacts"),
             int(config.height or 0),
             int(config.width or 0),
             config.colours,  # type: ignore[arg-type]  # checked by the configuration
             lowest=config.lowest,
             highest=config.highest,
             tangential=(x, y),
+            shows="contacts" if config.shows == "contacts" else "values",
         )
         self._lock = threading.Lock()
-        self._seen_ns = 0
 
     def __str__(self) -> str:
         return f"SkinwareCamera({self.config.driver or 'all drivers'}, {self.config.type_name})"
@@ -98,7 +92,7 @@ class SkinwareCamera(Camera):
 
     def read(self) -> Image:
         """Return the image nearest to this moment; wait half a period of the driver for it at most."""
-        return self._image()
+        return self.read_at(now_ns())
 
     def read_at(self, time_ns: int) -> Image:
         """Return the image nearest to a moment, for a robot that wants all of its sensors at one.
@@ -106,7 +100,7 @@ class SkinwareCamera(Camera):
         Args:
             time_ns: the moment, CLOCK_MONOTONIC ns.
         """
-        return self._image(time_ns)
+        return self._image(lambda: self._live.at(time_ns))
 
     def async_read(self, timeout_ms: float = 200) -> Image:
         """Return an image of touch that is newer than the one before; wait for it.
@@ -114,15 +108,7 @@ class SkinwareCamera(Camera):
         Args:
             timeout_ms: longest wait.
         """
-        deadline_ns = now_ns() + round(timeout_ms / 1000 * NS_PER_S)
-        seen_ns = self._seen_ns
-        while True:
-            image = self._image()
-            if self._seen_ns > seen_ns or self.is_held:
-                return image
-            if now_ns() >= deadline_ns:
-                raise TimeoutError(f"{self}: no newer touch within {timeout_ms:g} ms")
-            threading.Event().wait(0.001)
+        return self._image(lambda: self._live.newer(timeout_s=timeout_ms / 1000))
 
     def read_latest(self, max_age_ms: int = 500) -> Image:
         """Return the image nearest to this moment, whatever was read before.
@@ -130,7 +116,7 @@ class SkinwareCamera(Camera):
         Args:
             max_age_ms: oldest touch.
         """
-        image = self._image()
+        image = self.read()
         if -self.off_s * 1000 > max_age_ms:
             raise TimeoutError(f"{self}: the newest touch is {-self.off_s * 1000:.0f} ms old, not {max_age_ms} or less")
         return image
@@ -139,15 +125,13 @@ class SkinwareCamera(Camera):
         """Detach from the drivers."""
         self._live.close()
 
-    def _image(self, time_ns: int | None = None) -> Image:
+    def _image(self, take: Callable[[], tuple[Image, TouchSample]]) -> Image:
         if not self.is_connected:
             raise DeviceNotConnectedError(f"{self} is not connected")
         with self._lock:
-            time_ns = now_ns() if time_ns is None else time_ns
             try:
-                image, touch = self._live.at(time_ns)
+                image, touch = take()
             except ServiceTimeout as error:
                 raise TimeoutError(f"{self}: {error}") from error
-            self._seen_ns = int(touch.snapshot.acquired_ns.max())
-            self.is_held, self.off_s = touch.is_held, (self._seen_ns - time_ns) / NS_PER_S
+            self.is_held, self.off_s = touch.is_held, touch.off_s
         return image

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from lerobot.cameras.utils import make_cameras_from_configs
@@ -11,11 +11,10 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from lerobot_robot_skinware.configuration import SkinwareConfig
-from skinware.errors import ServiceTimeout
-from skinware.learning.features import CONTACT_NUMBERS, contact_numbers
-from skinware.learning.live import ChosenSensors, LiveTouch, Totals, TouchSample
+from skinware.errors import ServiceNotFound, ServiceTimeout
+from skinware.learning.features import CONTACT_NUMBERS, Totals, contact_numbers
+from skinware.learning.live import TouchSample
 from skinware.realtime import now_ns
-from skinware.tactile import ContactsReader
 
 HELD, AGE = "touch.held", "touch.age_s"
 
@@ -42,15 +41,8 @@ class Skinware(Robot):
         self.robot: Robot = make_robot_from_config(config.of_robot)
         self._own_cameras = make_cameras_from_configs(config.cameras)
         self.cameras = {**getattr(self.robot, "cameras", {}), **self._own_cameras}
-        self._touch = LiveTouch(
-            ChosenSensors(config.type_name, tuple(config.modules), config.regions or None),
-            drivers=[config.driver] if config.driver else None,
-            namespace=config.namespace or None,
-            max_age_s=None if config.max_age_ms is None else config.max_age_ms / 1000,
-            when_stale="hold" if config.when_stale == "hold" else "raise",
-        )
+        self._touch = config.touch(with_contacts=config.contacts > 0)
         self._totals: Totals | None = None
-        self._contacts: ContactsReader | None = None
 
     def __str__(self) -> str:
         return f"{self.robot} with touch"
@@ -62,9 +54,10 @@ class Skinware(Robot):
             was_open = self._touch.is_open
             if not was_open:
                 self._open()
-            each: Literal["taxel", "module"] = "taxel" if self.config.numbers == "taxel" else "module"
-            positions = self._touch.positions[:0] if self.config.numbers == "none" else self._touch.positions
-            self._totals = Totals(self._touch.layout, self.config.type_name, positions, each)
+            each, positions = self.config.numbers, self._touch.positions
+            if each == "none":
+                each, positions = "module", positions[:0]
+            self._totals = Totals(self._touch.layout, self.config.type_name, positions, each)  # type: ignore[arg-type]
             if not was_open:
                 self._touch.close()
         return self._totals
@@ -72,7 +65,7 @@ class Skinware(Robot):
     def _open(self) -> None:
         try:
             self._touch.open(timeout_s=self.config.timeout_s)
-        except ServiceTimeout as error:
+        except (ServiceNotFound, ServiceTimeout) as error:
             raise ConnectionError(f"{self}: {error}") from error
 
     @property
@@ -100,8 +93,6 @@ class Skinware(Robot):
         """
         _ = self._numbers
         self._open()
-        if self.config.contacts:
-            self._contacts = ContactsReader(namespace=self.config.contacts_namespace, timeout_s=self.config.timeout_s)
         for camera in self._own_cameras.values():
             camera.connect()
         self.robot.connect(calibrate)
@@ -138,10 +129,8 @@ class Skinware(Robot):
     def _touch_numbers(self, touch: TouchSample, time_ns: int) -> dict[str, float]:
         values = touch.values if self._numbers.names else touch.values[:0]
         numbers = dict(zip(self._numbers.names, self._numbers.of(values).tolist(), strict=True))
-        if self._contacts is not None:
-            found = contact_numbers(self._contacts.latest(), self.config.contacts)
-            for row, contact in enumerate(found.tolist()):
-                numbers |= {f"contact_{row}.{name}": x for name, x in zip(CONTACT_NUMBERS, contact, strict=True)}
+        for row, contact in enumerate(contact_numbers(touch.contacts, self.config.contacts).tolist()):
+            numbers |= {f"contact_{row}.{name}": x for name, x in zip(CONTACT_NUMBERS, contact, strict=True)}
         named = {f"touch.{name}": value for name, value in numbers.items()}
         age_s = (time_ns - int(np.min(touch.snapshot.acquired_ns))) / 1e9
         return {**named, AGE: age_s, **({HELD: float(touch.is_held)} if self.config.when_stale == "hold" else {})}
@@ -156,7 +145,4 @@ class Skinware(Robot):
         for camera in self._own_cameras.values():
             if camera.is_connected:
                 camera.disconnect()
-        if self._contacts is not None:
-            self._contacts.close()
-            self._contacts = None
         self._touch.close()

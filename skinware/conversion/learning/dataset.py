@@ -13,6 +13,7 @@ import numpy.typing as npt
 from skinware.conversion.learning.features import (
     IMAGE,
     STATISTICS,
+    VIDEO,
     Batch,
     Feature,
     Moments,
@@ -20,11 +21,13 @@ from skinware.conversion.learning.features import (
     pixel_count,
     pixels_of,
 )
+from skinware.conversion.learning.videos import Video
 from skinware.conversion.tables import pyarrow
 
 VERSION = "v3.0"
 _CHUNK_FILES, _FILE_MB, _VIDEO_MB = 1000, 100, 200
 _PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_VIDEO_PLACE = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _OF_ALL = {
     "timestamp": Feature("float32", (1,)),
     "frame_index": Feature("int64", (1,)),
@@ -43,18 +46,29 @@ class DatasetWriter:
     Args:
         folder: of the dataset; it must not exist.
         fps: rows a second.
+        video: images are written as videos.
 
     Raises:
         MissingExtra: pyarrow is not installed.
         OSError: it cannot be written.
     """
 
-    def __init__(self, folder: Path, fps: int, features: Mapping[str, Feature], lengths: Sequence[int]) -> None:
+    def __init__(
+        self, folder: Path, fps: int, features: Mapping[str, Feature], lengths: Sequence[int], *, video: bool = False
+    ) -> None:
         self._arrow = pyarrow()
         self._folder, self._fps = folder, fps
-        self._features: dict[str, Feature] = {**features, **_OF_ALL}
+        images = [name for name, each in features.items() if each.dtype == IMAGE and video]
+        self._features: dict[str, Feature] = {
+            **features,
+            **{name: features[name]._replace(dtype=VIDEO) for name in images},
+            **_OF_ALL,
+        }
+        self._videos = images
+        self._video_info: dict[str, Mapping[str, Any]] = {}
         (folder / "meta").mkdir(parents=True)
-        schema = self._arrow.schema([(name, _type(self._arrow, each)) for name, each in self._features.items()])
+        self._stored = {name: each for name, each in self._features.items() if each.dtype != VIDEO}
+        schema = self._arrow.schema([(name, _type(self._arrow, each)) for name, each in self._stored.items()])
         self._data = _Files(folder / "data", schema)
         self._episodes = _Files(folder / "meta" / "episodes", self._episode_schema())
         self._tasks: dict[str, int] = {}
@@ -71,6 +85,7 @@ class DatasetWriter:
         task_index = self._tasks.setdefault(task, len(self._tasks))
         statistics = _FeatureStatistics(self._features, [length], _EPISODE_SAMPLE_BYTES)
         done = 0
+        videos = {name: self._video(name) for name in self._videos}
         for batch in batches:
             count = len(next(iter(batch.values())))
             number = np.arange(done, done + count)
@@ -81,13 +96,17 @@ class DatasetWriter:
                 "index": self._rows + number[:, np.newaxis],
                 "task_index": np.full((count, 1), task_index),
             }
-            arrays = [_column(self._arrow, each, rows[name]) for name, each in self._features.items()]
+            arrays = [_column(self._arrow, each, rows[name]) for name, each in self._stored.items()]
             self._data.write(arrays)
+            for name, video in videos.items():
+                video.add(rows[name])
             for name, numbers in self._numbers(rows, number, length):
                 moments = Moments.of(numbers)
                 statistics.add(name, numbers, moments)
                 self._whole.add(name, numbers, moments)
             done += count
+        for video in videos.values():
+            video.close()
         self._write_episode(task, done, place, statistics.result())
         self._rows, self._count = self._rows + done, self._count + 1
 
@@ -121,9 +140,10 @@ class DatasetWriter:
             "fps": self._fps,
             "splits": {"train": f"0:{self._count}"},
             "data_path": f"data/{_PLACE}",
-            "video_path": None,
+            "video_path": _VIDEO_PLACE if self._videos else None,
             "features": {
                 name: {"dtype": each.dtype, "shape": list(each.shape), "names": each.names and list(each.names)}
+                | ({"info": self._video_info[name]} if each.dtype == VIDEO else {})
                 for name, each in self._features.items()
             },
         }
@@ -134,7 +154,7 @@ class DatasetWriter:
     ) -> Iterator[tuple[str, npt.NDArray[Any]]]:
         """Yield (feature, data for its statistics): the numbers of all rows, and pixels of some images."""
         for name, each in self._features.items():
-            if each.dtype != IMAGE:
+            if each.dtype not in (IMAGE, VIDEO):
                 yield name, rows[name]
                 continue
             chosen = rows[name][number % _image_step(length) == 0]
@@ -147,19 +167,37 @@ class DatasetWriter:
         fields = [("episode_index", arrow.int64()), ("tasks", arrow.list_(arrow.string())), ("length", arrow.int64())]
         fields += [(name, arrow.int64()) for name in integers]
         for name, each in self._features.items():
-            depth = 3 if each.dtype == IMAGE else len(each.shape)
+            depth = 3 if each.dtype in (IMAGE, VIDEO) else len(each.shape)
             for what in STATISTICS:
                 item, nested = (arrow.int64(), 1) if what == "count" else (arrow.float64(), depth)
                 for _ in range(nested):
                     item = arrow.list_(item)
                 fields.append((f"stats/{name}/{what}", item))
+        for name in self._videos:
+            fields += [(f"videos/{name}/{what}", arrow.int64()) for what in ("chunk_index", "file_index")]
+            fields += [(f"videos/{name}/{what}", arrow.float64()) for what in ("from_timestamp", "to_timestamp")]
         fields += [(f"meta/episodes/{name}", arrow.int64()) for name in ("chunk_index", "file_index")]
         return arrow.schema(fields)
+
+    def _video(self, name: str) -> Video:
+        """The file of a feature in the next episode, each of which has one."""
+        chunk, file = divmod(self._count, _CHUNK_FILES)
+        path = self._folder / _VIDEO_PLACE.format(video_key=name, chunk_index=chunk, file_index=file)
+        video = Video(path, self._fps, self._features[name].shape)
+        self._video_info[name] = video.info
+        return video
 
     def _write_episode(
         self, task: str, length: int, place: Mapping[str, int], statistics: Mapping[str, Mapping[str, Any]]
     ) -> None:
         own = self._episodes.next_place()
+        chunk, file = divmod(self._count, _CHUNK_FILES)
+        video = {
+            "chunk_index": chunk,
+            "file_index": file,
+            "from_timestamp": 0.0,
+            "to_timestamp": length / self._fps,
+        }
         row = {
             "episode_index": self._count,
             "tasks": [task],
@@ -167,6 +205,7 @@ class DatasetWriter:
             "dataset_from_index": self._rows,
             "dataset_to_index": self._rows + length,
             **{f"data/{name}": number for name, number in place.items()},
+            **{f"videos/{name}/{what}": each for name in self._videos for what, each in video.items()},
             **{f"stats/{name}/{what}": each.tolist() for name, of in statistics.items() for what, each in of.items()},
             **{f"meta/episodes/{name}": number for name, number in own.items()},
         }
@@ -217,7 +256,7 @@ class _FeatureStatistics:
     def __init__(self, features: Mapping[str, Feature], lengths: Sequence[int], most_bytes: int) -> None:
         self._of: dict[str, Statistics] = {}
         for name, each in features.items():
-            if each.dtype == IMAGE:
+            if each.dtype in (IMAGE, VIDEO):
                 images = sum(len(range(0, length, _image_step(length))) for length in lengths)
                 pixels = pixel_count(each.shape)
                 self._of[name] = Statistics((3, 1, 1), np.float32, images * pixels, most_bytes, pixels)

@@ -35,6 +35,8 @@ from skinware.structure import Structure
 LEARNING_FORMATS = {"lerobot": "-lerobot"}
 """Suffix of the folders of each format."""
 
+_MISSING = 1.5
+"""Values are interpolated between samples that are at most so many periods apart."""
 _BATCH_BYTES = 16 << 20
 _BYTES_PER_SENSOR = 4 + 1 + 4
 """Bytes of a sensor's value, status and raw value."""
@@ -81,7 +83,7 @@ def convert_to_learning_set(
         with begun_beside(target) as begun:
             for number, episodes in enumerate(sets, 1):
                 folder = begun / str(number) if wanted.each_structure else begun
-                _Set(recordings, wanted, joined, episodes).write(folder)
+                notes += _Set(recordings, wanted, joined, episodes).write(folder)
                 for episode in episodes:
                     frames.update(dict.fromkeys(episode.frames, len(episode)))
     return Converted(target, frames, notes, sum(map(len, sets)))
@@ -172,6 +174,7 @@ class _Set:
         self, recordings: _Recordings, wanted: LearningSet, joined: Sequence[Joined], episodes: Sequence[Episode]
     ) -> None:
         self._recordings, self._wanted, self._episodes = recordings, wanted, episodes
+        self._reach = int(wanted.resample == "linear")
         first = episodes[0]
         self._tables = {name: first.piece.tables[name] for name in sorted(first.piece.tables)}
         self._windows = {name: self._window(name) for name in self._tables}
@@ -180,7 +183,8 @@ class _Set:
         for name, timed in self._tables.items():
             table = recordings.table(first.recording, timed.name)
             names, window = table.sensor_names, self._windows[name]
-            self._skins[name] = SkinFeatures(name, timed.structure, names, window, timed.period_ns)
+            longest_ns = round(_MISSING * NS_PER_S / timed.rate_hz) if self._reach and timed.rate_hz else 0
+            self._skins[name] = SkinFeatures(name, timed.structure, names, window, timed.period_ns, longest_ns)
             self._sensors[name] = sensor_table(table)
         self._joined = [JoinedFeature(each) for each in joined]
         self._features: dict[str, Feature] = {}
@@ -195,8 +199,10 @@ class _Set:
             self._form = SetForm(wanted, {name: timed.structure for name, timed in self._tables.items()})
             self._features = self._form.described(self._features)
 
-    def write(self, folder: Path) -> None:
-        writer = DatasetWriter(folder, self._wanted.fps, self._features, [len(each) for each in self._episodes])
+    def write(self, folder: Path) -> list[str]:
+        """Write the set, and return a line for each driver whose values were interpolated."""
+        lengths, video = [len(each) for each in self._episodes], self._wanted.video
+        writer = DatasetWriter(folder, self._wanted.fps, self._features, lengths, video=video)
         try:
             readers: dict[TimedTable, Frames] = {}
             for episode in self._episodes:
@@ -209,9 +215,11 @@ class _Set:
         finally:
             writer.close()
         self._write_beside(folder / "meta" / "skin")
+        counts = {name: skin.interpolated for name, skin in self._skins.items() if self._reach}
+        return [f"{name}: {count} of {sum(lengths)} rows are interpolated" for name, count in counts.items()]
 
     def _frames(self, episode: Episode, timed: TimedTable, window: int) -> Frames:
-        return Frames(self._recordings.table(episode.recording, timed.name), timed.recorded_ns, window)
+        return Frames(self._recordings.table(episode.recording, timed.name), timed.recorded_ns, window + self._reach)
 
     def _window(self, name: str) -> int:
         windows = {episode.piece.tables[name].window(self._wanted) for episode in self._episodes}
@@ -230,7 +238,8 @@ class _Set:
             batch: Batch = {}
             for name, skin in self._skins.items():
                 newest = episode.frames[name][part]
-                wanted = newest[:, np.newaxis] + np.arange(1 - self._windows[name], 1)
+                wanted = newest[:, np.newaxis] + np.arange(1 - self._windows[name], 1 + self._reach)
+                wanted = np.minimum(wanted, len(episode.piece.tables[name].times_ns) - 1)
                 numbers, of_rows = np.unique(wanted, return_inverse=True)
                 frames = readers[episode.piece.tables[name]].take(numbers)
                 batch |= skin.rows(frames, of_rows.reshape(wanted.shape), episode.times_ns[part])
@@ -243,8 +252,10 @@ class _Set:
         folder.mkdir()
         for name, sensors in self._sensors.items():
             arrow.parquet.write_table(arrow.table(sensors), folder / f"{name.replace('/', '_')}.sensors.parquet")
+        of_all = {"resample": self._wanted.resample}
         times = [
             {"episode": number, "file": self._recordings.paths[each.recording].name, "start_ns": int(each.times_ns[0])}
+            | of_all
             for number, each in enumerate(self._episodes)
         ]
         (folder / "episodes.json").write_text(json.dumps(times, indent=1) + "\n", encoding="utf-8")

@@ -22,7 +22,7 @@ from skinware.structure import Structure
 
 MOST_NAMES = 4096
 """Most names of sensors in the description of a feature; the side file has them all."""
-IMAGE = "image"
+IMAGE, VIDEO = "image", "video"
 _PNG, _RGB = b"\x89PNG\r\n\x1a\n", (8, 2)
 _OF_MODULES, _OF_GROUPS = COLUMNS + "module_time_ns", COLUMNS + "group_time_ns"
 _NEEDED = (COLUMNS + "values", COLUMNS + "status", TIME)
@@ -36,7 +36,7 @@ class Feature(NamedTuple):
     """The format of a feature's rows.
 
     Attributes:
-        dtype: a numpy name, or ``image``.
+        dtype: a numpy name, ``image`` or ``video``.
         shape: of a row; (1,) for one number.
         names: of its numbers or axes; None: no names.
     """
@@ -53,12 +53,23 @@ class SkinFeatures:
         sensor_names: in the order of its values.
         window: number of samples in a row, the oldest first.
         period_ns: the driver's nominal period, 0 if it has none.
+        longest_ns: values are interpolated between samples that are not further apart; 0: never.
+
+    Attributes:
+        interpolated: number of rows with values between two samples.
     """
 
     def __init__(
-        self, service: str, structure: Structure, sensor_names: Sequence[str], window: int, period_ns: int
+        self,
+        service: str,
+        structure: Structure,
+        sensor_names: Sequence[str],
+        window: int,
+        period_ns: int,
+        longest_ns: int = 0,
     ) -> None:
-        self._structure, self._window = structure, window
+        self._structure, self._window, self._longest_ns = structure, window, longest_ns
+        self.interpolated = 0
         self._limits_ns = structure.group_age_limits_ns(period_ns)
         self._prefix = "observation.tactile." + service.replace("/", "_")
         self._types = {
@@ -76,15 +87,36 @@ class SkinFeatures:
                 shape, names = (self._window, *shape), ["frame", "sensor"]
             described[f"{self._prefix}.{type_name}"] = Feature("float32", shape, names)
             described[f"{self._prefix}.{type_name}_status"] = Feature("uint8", shape, names)
+        if self._longest_ns:
+            described[f"{self._prefix}.interpolated"] = Feature("float32", (1,))
         return described | {f"{self._prefix}.age": Feature("float32", (self._window,))}
 
     def rows(self, frames: Block, numbers: npt.NDArray[np.int64], rows_ns: npt.NDArray[np.int64]) -> Batch:
         """Return the features of t rows.
 
         Args:
-            numbers: (t, window) samples of each row, the newest last.
+            numbers: (t, window) samples of each row, the newest last; to interpolate (t, 2): the one before and after.
             rows_ns: (t,) time of each row, wall clock.
         """
+        if self._longest_ns:
+            return self._blended(frames, numbers, rows_ns)
+        return self._taken(frames, numbers, rows_ns)
+
+    def _blended(self, frames: Block, numbers: npt.NDArray[np.int64], rows_ns: npt.NDArray[np.int64]) -> Batch:
+        before, after = (self._taken(frames, numbers[:, place : place + 1], rows_ns) for place in (0, 1))
+        begin_ns, end_ns = frames[TIME][numbers].T
+        span_ns = end_ns - begin_ns
+        share = np.where(span_ns > 0, (rows_ns - begin_ns) / np.maximum(span_ns, 1), 0.0)
+        share = np.where(span_ns <= self._longest_ns, np.clip(share, 0.0, 1.0), 0.0).astype(np.float32)[:, np.newaxis]
+        self.interpolated += int(np.count_nonzero(share))
+        batch = dict(before)
+        for type_name in self._types:
+            name = f"{self._prefix}.{type_name}"
+            batch[name] = before[name] + share * (after[name] - before[name])
+            batch[f"{name}_status"] = before[f"{name}_status"] | np.where(share > 0, after[f"{name}_status"], 0)
+        return batch | {f"{self._prefix}.interpolated": share}
+
+    def _taken(self, frames: Block, numbers: npt.NDArray[np.int64], rows_ns: npt.NDArray[np.int64]) -> Batch:
         late_ns = rows_ns - frames[TIME][numbers[:, -1]]
         status = self._status(frames, numbers, late_ns)
         batch: Batch = {}

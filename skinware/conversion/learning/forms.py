@@ -13,13 +13,14 @@ from skinware.conversion.learning.features import IMAGE, Batch, Feature
 from skinware.conversion.learning.wanted import LearningSet
 from skinware.conversion.tables import package
 from skinware.errors import ConfigurationError
+from skinware.learning.features import Totals, points
 from skinware.learning.images import Colours, TouchImage, range_of
-from skinware.learning.live import Totals, points
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 
 STATE, AGE = "observation.state", "touch.age_s"
 _TACTILE = "observation.tactile."
+INTERPOLATED = _TACTILE + "interpolated"
 
 
 class SetForm:
@@ -48,6 +49,8 @@ class SetForm:
     def described(self, features: Mapping[str, Feature]) -> dict[str, Feature]:
         """Return the features of the set, in place of those of the drivers."""
         others = {name: each for name, each in features.items() if not name.startswith(_TACTILE)}
+        if self._wanted.resample == "linear":
+            others[INTERPOLATED] = Feature("float32", (1,))
         if self._wanted.form == "images":
             height, width = self._wanted.size
             shape, axes = (height, width, 3), ["height", "width", "channels"]
@@ -67,6 +70,9 @@ class SetForm:
     def rows(self, batch: Batch) -> Batch:
         """Return rows of the set's features, made of those of the drivers."""
         others = {name: rows for name, rows in batch.items() if not name.startswith(_TACTILE)}
+        if self._wanted.resample == "linear":
+            shares = [batch[f"{_TACTILE}{self._key(driver)}.interpolated"] for driver in self._drivers]
+            others[INTERPOLATED] = np.max(shares, axis=0)
         values = {name: self._values(batch, name) for name in self._types}
         if self._wanted.form == "images":
             return others | {

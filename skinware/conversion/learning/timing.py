@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.learning.wanted import Interval, Joined, LearningSet, matched
+from skinware.conversion.learning.wanted import Interval, Joined, LearningSet, Match, matched
 from skinware.conversion.tables import TIME, Table, TableSource
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.realtime import NS_PER_S
@@ -87,7 +87,7 @@ class Episode:
 
     Attributes:
         times_ns: (t,) of each row, wall clock.
-        frames: by driver, (t,) number of the newest sample at each row.
+        frames: by driver, (t,) number of each row's sample, or of the one before the row.
     """
 
     recording: int
@@ -225,7 +225,8 @@ class Planner:
         rows_ns = self._rows(begin_ns, end_ns)
         if not len(rows_ns):
             return None
-        frames = {name: np.searchsorted(timed.times_ns, rows_ns, "right") - 1 for name, timed in piece.tables.items()}
+        match: Match = "nearest" if self._wanted.resample == "nearest" else "previous"
+        frames = {name: matched(timed.times_ns, rows_ns, match, 1 << 62) for name, timed in piece.tables.items()}
         joined = {each.name: self._matched(each, times_ns, rows_ns, limit_ns) for each, times_ns in self._joined}
         return Episode(self._number, task, rows_ns, piece, frames, joined)
 

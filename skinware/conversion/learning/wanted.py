@@ -17,9 +17,11 @@ from skinware.conversion.foreign import open_source
 from skinware.conversion.foreign.source import Rows, whole
 from skinware.conversion.tables import TableSource
 from skinware.errors import ConfigurationError
+from skinware.learning.features import Each
 from skinware.realtime import NS_PER_S
 from skinware.text import nearest_name
 
+Match = Literal["previous", "nearest"]
 _COLUMNS = ("start_s", "end_s", "task", "file")
 _END = "end"
 RESERVED = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task")
@@ -69,6 +71,10 @@ class LearningSet:
         intervals: the episodes; empty: each recording is one.
         gap_s: a silence of a driver that ends an episode and begins the next; None: no silence does.
         joins: files of joints, actions and cameras that become features.
+        resample: which sample a row has: the newest (``previous``) or the ``nearest`` one, by the times of publication;
+            or ``linear``: values between the two around it, unless one is missing between them; a feature
+            ``interpolated`` then says the share of the later one, and a status is that of both.
+        video: write images as videos, as LeRobot's own encoder does: small, and not exact.
         match: which joined row belongs to a row: the newest at or before its time, or the nearest.
         within_s: greatest distance of a joined row; None: the time between two rows.
         at: name of a joined feature whose times are those of the rows; empty: a row each 1 / fps.
@@ -77,7 +83,7 @@ class LearningSet:
         form: ``tactile``: values, status and age of each driver; or in a form that stock policies of LeRobot read:
             ``state``: numbers in ``observation.state``, as the robot ``skinware`` has them; ``images``, as the camera
             has them; ``points``: (n, 6) places and forces.
-        numbers: of ``state``: sum and largest value of each ``module``, or each ``taxel``.
+        numbers: of ``state``: sum and largest value of each ``module``, each ``taxel``, or place and force (``point``).
         size: height and width of images.
         colours: of images.
         value_range: of the darkest and brightest colour; None: of the sensor type.
@@ -89,13 +95,15 @@ class LearningSet:
     intervals: Sequence[Interval] = ()
     gap_s: float | None = None
     joins: Sequence[Join] = ()
-    match: Literal["previous", "nearest"] = "previous"
+    resample: Literal["previous", "nearest", "linear"] = "previous"
+    video: bool = False
+    match: Match = "previous"
     within_s: float | None = None
     at: str = ""
     each_structure: bool = False
     by_marks: bool = False
     form: Literal["tactile", "state", "images", "points"] = "tactile"
-    numbers: Literal["module", "taxel"] = "module"
+    numbers: Each = "module"
     size: tuple[int, int] = (64, 64)
     colours: Literal["grey", "signed", "log"] = "grey"
     value_range: tuple[float, float] | None = None
@@ -103,6 +111,8 @@ class LearningSet:
     def __post_init__(self) -> None:
         if self.fps < 1 or self.window < 0:
             raise ConfigurationError(f"{self.fps} rows a second, {self.window} frames in each: that is no learning set")
+        if self.resample == "linear" and self.window != 1:
+            raise ConfigurationError("values between samples have one sample in a row: leave out --window")
         names = [join.feature for join in self.joins]
         for name in names:
             if not name or "/" in name or name in RESERVED or names.count(name) > 1:
@@ -309,7 +319,7 @@ class Joined:
 def matched(
     times_ns: npt.NDArray[np.int64],
     at_ns: npt.NDArray[np.int64],
-    match: Literal["previous", "nearest"],
+    match: Match,
     limit_ns: int,
 ) -> npt.NDArray[np.int64]:
     """Return the index of the time that belongs to each moment, (t,); -1: none is near enough.

@@ -69,8 +69,9 @@ class Card {
   /** The line of the last seconds. */
   #draw() {
     const series = this.plotting.seriesOf(this.probe);
-    if (!series || this.drawn === series.newest_ns) return;
-    this.drawn = series.newest_ns;
+    const until_ns = this.plotting.until(this.probe);
+    if (!series || this.drawn === until_ns) return;
+    this.drawn = until_ns;
     const window = { from: this.drawn - 1e9 * SHOWN_S, to: this.drawn, width: WIDTH };
     const pieces = piecesOf(series.times, series.values, window);
     const [low, high] = rangeOf(pieces) ?? [null, null];

@@ -211,15 +211,17 @@ function takeState(state) {
   now.recording = state.recording ?? null;
   plotting.takeState(state);
   tree.update(skin, states);
-  list.update(now.problems, plotting.now_ns);
+  list.update(now.problems, plotting.server_ns);
   showRecording(byId("record"), now.recording);
 }
 
 function takeReplays({ replays = replay.replays, outlines = now.outlines }) {
   now.outlines = outlines;
-  const wasPaused = replay.isPaused;
+  const [wasPaused, before_ns] = [replay.isPaused, plotting.now_ns];
   replay.update(replays, outlines);
-  if (replays.length && replay.isPaused !== wasPaused) plotting.strips.freeze(replay.isPaused);
+  plotting.takeReplays(replays, outlines);
+  const hasMoved = plotting.isRecorded && plotting.now_ns !== before_ns;
+  if (replays.length && (replay.isPaused !== wasPaused || (replay.isPaused && hasMoved))) plotting.strips.freeze(replay.isPaused);
   setHidden(byId("rewind"), replays.length > 0);
   if (moments.take(replays)) keep();
 }

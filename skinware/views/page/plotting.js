@@ -1,6 +1,7 @@
 // What is plotted: which lines, asked of the server, drawn in strips, and events that a person marks.
 
 import { h } from "./dom.js";
+import { clock } from "./format.js";
 import { contactLine, Lines, partLine, taxelLine } from "./series.js";
 import { Strips } from "./strips.js";
 
@@ -16,12 +17,16 @@ export class Plotting {
   constructor(host, parts) {
     Object.assign(this, parts);
     this.marks = [];
-    this.now_ns = 0;
+    this.server_ns = 0;
+    this.moments = []; // of recordings, where each is, in the order of their titles
+    this.events = [];
     this.offset_ms = 0; // from the server's clock to the time of day
     this.lines = new Lines(this.send);
     this.strips = new Strips(host, this.lines, {
       now_ns: () => this.now_ns,
-      marks: () => this.marks,
+      shift_ns: (line) => this.#shift_ns(driverOf(line)),
+      isRecorded: () => this.isRecorded,
+      marks: () => (this.isRecorded ? this.events : this.marks),
       moment_s: () => (this.rewind.isPaused ? this.rewind.at_s : null),
       footer: (lines, time_ns) => this.footer(lines.map(driverOf), time_ns),
       changed: () => {
@@ -40,9 +45,39 @@ export class Plotting {
   }
 
   take(taken) {
-    this.now_ns = Number(taken.header.now_ns);
-    this.offset_ms = Date.now() - this.now_ns / 1e6;
+    this.server_ns = Number(taken.header.now_ns);
+    this.offset_ms = Date.now() - this.server_ns / 1e6;
     this.lines.take(taken);
+  }
+
+  /** The recordings that are shown are at these moments, or others are. */
+  takeReplays(replays, outlines) {
+    this.moments = replays.filter(({ title }) => title).map(({ title, time_s }) => ({ title, ns: 1e9 * time_s }));
+    const marks = (at) => (outlines[at]?.events ?? []).filter(({ event }) => event === "mark");
+    this.events = this.moments.flatMap(({ ns }, at) =>
+      marks(at).map(({ time_s, text }) => ({ time_ns: 1e9 * time_s + this.moments[0].ns - ns, text })),
+    );
+  }
+
+  /** Times of plots are those in a recording, the first one that is shown. */
+  get isRecorded() {
+    return this.moments.length > 0;
+  }
+
+  get now_ns() {
+    return this.isRecorded ? this.moments[0].ns : this.server_ns;
+  }
+
+  /** From times in the recording of a driver to those in the first: what is shown at once is at one time. */
+  #shift_ns(driver) {
+    const own = this.moments.find(({ title }) => driver.startsWith(`${title}/`));
+    return own ? this.moments[0].ns - own.ns : 0;
+  }
+
+  /** The newest time of a taxel's values that is not after what is shown. */
+  until(probe) {
+    const newest_ns = this.seriesOf(probe)?.newest_ns;
+    return this.isRecorded ? this.now_ns - this.#shift_ns(probe.sheet.driver.key) : newest_ns;
   }
 
   takeState({ marks = [], recording = null, functions = [] }) {
@@ -126,8 +161,8 @@ export class Plotting {
   footer(keys, time_ns = this.now_ns) {
     const drivers = [...this.skin.drivers.values()].filter(({ key }) => keys.includes(key));
     const names = drivers.map(({ name, type }) => (name === type ? name : `${name} (${type})`));
-    const time = new Date(time_ns / 1e6 + this.offset_ms).toISOString().replace("T", " ").replace(/\.\d+Z/, " UTC");
-    return [...names, time].join(", ");
+    const of_day = () => new Date(time_ns / 1e6 + this.offset_ms).toISOString().replace("T", " ").replace(/\.\d+Z/, " UTC");
+    return [...names, this.isRecorded ? `${this.moments[0].title} at ${clock(time_ns / 1e9)}` : of_day()].join(", ");
   }
 }
 

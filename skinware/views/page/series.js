@@ -3,6 +3,7 @@
 import { resolve } from "./probes.js";
 
 export const KEPT_S = 60;
+const AHEAD_S = 5; // beyond the moment that is shown: values of recordings come before their time
 const MOST = 65_536; // samples of a line
 const FIRST = 1024;
 const NUMBERS = 8; // choices whose values may still be on their way
@@ -29,6 +30,10 @@ export class Series {
     return this.#end > this.#begin ? this.time_ns[this.#end - 1] : -Infinity;
   }
 
+  clear() {
+    this.#begin = this.#end = 0;
+  }
+
   /** Add a sample; one that is not newer than all before is known already. */
   push(time_ns, value) {
     if (time_ns <= this.newest_ns) return;
@@ -36,7 +41,7 @@ export class Series {
     this.time_ns[this.#end] = time_ns;
     this.value[this.#end++] = value;
     if (this.#end - this.#begin > MOST) this.#begin++;
-    while (this.time_ns[this.#begin] < time_ns - 1e9 * KEPT_S) this.#begin++;
+    while (this.time_ns[this.#begin] < time_ns - 1e9 * (KEPT_S + AHEAD_S)) this.#begin++;
   }
 
   #makeRoom() {
@@ -132,13 +137,14 @@ export class Lines {
   take({ header, blob }) {
     if (!header.plots) return;
     this.missed = header.plots.missed;
-    for (const { number, of, lines, time_ns, values } of header.plots.blocks) {
+    for (const { number, of, lines, time_ns, values, begins } of header.plots.blocks) {
       const times = Float64Array.from(blob(time_ns, BigInt64Array), Number);
       const all = blob(values, Float64Array);
       lines.forEach((line, column) => {
         const series = this.#series.get(this.#numbers.get(number)?.[line]);
         if (!series) return;
         series.of = of;
+        if (begins) series.clear();
         for (let k = 0; k < times.length; k++) series.push(times[k], all[k * lines.length + column]);
       });
     }

@@ -1,7 +1,7 @@
 // One strip: lines of one unit over the same seconds, or the spectrum of one of them; drawn with either pen.
 
 import { piecesOf, rangeOf, ticksOf } from "./curves.js";
-import { figure, measure } from "./format.js";
+import { clock, figure, measure } from "./format.js";
 import { GROUND, INK } from "./palette.js";
 import { placeOf } from "./series.js";
 import { spectrumOf } from "./spectrum.js";
@@ -34,7 +34,7 @@ export function valueAt({ times, values }, time_ns) {
  * Draw values over time.
  * @param {object} pen of pens.js.
  * @param {object} what `width`, `height`, `theme`, `from` and `to` (ns), `lines` ([{times, values}]), `unit`,
- *     `marks` ([{time_ns, text}]), `cursor_ns`, `moment_ns` (null: none).
+ *     `marks` ([{time_ns, text}]), `cursor_ns`, `moment_ns` (null: none), `isRecorded`: times began with a recording.
  */
 export function drawTimes(pen, what) {
   const plot = plotOf(what);
@@ -43,7 +43,10 @@ export function drawTimes(pen, what) {
   const [low, high] = roomFor(rangeOf(pieces.flat()));
   const xOf = (time_ns) => plot.x + ((time_ns - from) / (to - from)) * plot.width;
   const span_s = (to - from) / 1e9;
-  const seconds = ticksOf(-span_s, 0, plot.width / TICK_X).map((s) => [xOf(to + 1e9 * s), `${figure(s)} s`]);
+  const most = plot.width / TICK_X;
+  const seconds = what.isRecorded
+    ? ticksOf(Math.max(0, from / 1e9), to / 1e9, most).map((s) => [xOf(1e9 * s), clock(s)])
+    : ticksOf(-span_s, 0, most).map((s) => [xOf(to + 1e9 * s), `${figure(s)} s`]);
   const yOf = axes(pen, what, plot, [low, high], seconds);
   pen.within(plot.x, plot.y, plot.width, plot.height, () => {
     pieces.forEach((own, k) => {

@@ -101,9 +101,9 @@ class Strip {
   }
 
   #what(size, theme) {
-    const { from, to, marks, cursor_ns, moment_ns } = this.strips.window;
+    const window = this.strips.window;
     const lines = this.lines.map((line) => this.strips.dataOf(line));
-    return { ...size, theme, from, to, lines, unit: this.unit, marks, cursor_ns, moment_ns, cursor_hz: this.cursor_hz };
+    return { ...size, ...window, theme, lines, unit: this.unit, cursor_hz: this.cursor_hz };
   }
 
   /** The values of the line whose spectrum is shown, within the window. */
@@ -220,7 +220,8 @@ export class Strips {
   /**
    * @param {HTMLElement} host
    * @param {Lines} lines of series.js.
-   * @param {object} parts `now_ns()`; `marks()`; `moment_s()`: seconds back of what is shown, null: none;
+   * @param {object} parts `now_ns()`; `shift_ns(line)`: from its times to those of the axis; `isRecorded()`: times are
+   *     those since a recording began; `marks()`; `moment_s()`: seconds back of what is shown, null: none;
    *     `footer(lines, time_ns)`: whose values, of when; `changed()`: other lines; `refuse(text)`; `find(key)`: the
    *     line that is dragged.
    */
@@ -301,15 +302,18 @@ export class Strips {
 
   /** Let time stand still, or go on. */
   freeze(isFrozen) {
-    this.#frozen = isFrozen ? new Map(this.all.map(({ key }) => [key, this.lines.get(key)?.copy()])) : null;
+    const kept = this.parts.isRecorded() ? [] : this.all; // what was recorded stays as it is
+    this.#frozen = isFrozen ? new Map(kept.map(({ key }) => [key, this.lines.get(key)?.copy()])) : null;
     this.frozen_ns = this.parts.now_ns();
     this.#end_ns = null;
     this.draw();
   }
 
-  dataOf({ key }) {
-    const kept = this.#frozen?.get(key) ?? this.lines.get(key);
-    return kept ? { times: kept.times, values: kept.values } : NOTHING;
+  dataOf(line) {
+    const kept = this.#frozen?.get(line.key) ?? this.lines.get(line.key);
+    if (!kept) return NOTHING;
+    const shift_ns = this.parts.shift_ns(line);
+    return { times: shift_ns ? kept.times.map((time_ns) => time_ns + shift_ns) : kept.times, values: kept.values };
   }
 
   get #now_ns() {
@@ -321,7 +325,8 @@ export class Strips {
     const to = this.#end_ns ?? this.#now_ns;
     const back_s = this.parts.moment_s();
     const moment_ns = this.#frozen && back_s !== null ? this.frozen_ns + 1e9 * back_s : null;
-    return { from: to - 1e9 * this.#span_s, to, marks: this.parts.marks(), cursor_ns: this.cursor_ns, moment_ns };
+    const isRecorded = this.parts.isRecorded();
+    return { from: to - 1e9 * this.#span_s, to, isRecorded, marks: this.parts.marks(), cursor_ns: this.cursor_ns, moment_ns };
   }
 
   point(part) {

@@ -5,6 +5,12 @@ import { clock } from "./format.js";
 import { Timeline } from "./timeline.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8];
+const MATCHES = {
+  begin: ["their begins", () => 0],
+  day: ["time of day", ({ began_s }) => -began_s],
+  mark: ["first marks", (_, { events = [] }) => events.find(({ event }) => event === "mark")?.time_s],
+};
+const [BY_HAND, NEAR_S] = ["hand", 0.05];
 
 /** Pause and the slider of what was. */
 export class Rewind {
@@ -73,8 +79,12 @@ export class ReplayControls {
     this.speed = h("select", { "aria-label": "Speed" }, ...SPEEDS.map((x) => h("option", { value: x }, `${x}×`)));
     this.speed.addEventListener("change", () => act("speed", Number(this.speed.value)));
     this.loop = button("Loop", "Begin again at the end", () => act("loop", !this.replays[0].loop));
+    this.match = h("select", {}, ...Object.entries(MATCHES).map(([value, [text]]) => h("option", { value }, text)));
+    this.match.append(h("option", { value: BY_HAND }, "by hand"));
+    this.match.addEventListener("change", () => this.#rematch());
+    this.matching = h("label", { class: "field", title: "What of the recordings is shown at the same moment" }, h("span", {}, "Match"), this.match);
     this.list = h("div", { class: "timelines" });
-    host.append(this.play, this.back, this.on, this.speed, this.loop, this.list);
+    host.append(this.play, this.back, this.on, this.speed, this.loop, this.matching, this.list);
   }
 
   get isPaused() {
@@ -106,9 +116,43 @@ export class ReplayControls {
     });
   }
 
+  /** How much later than in the first recording the moment of each is that matches; undefined: it has none. */
+  #offsets_s(of) {
+    const at_s = this.replays.map((replay, i) => of(replay, this.outlines[i] ?? {}));
+    return at_s.map((time_s) => time_s - at_s[0]);
+  }
+
+  /** Bring the others to the moment that matches the one of the first. */
+  #rematch() {
+    const of = MATCHES[this.match.value]?.[1];
+    const [first] = this.replays;
+    this.#offsets_s(of ?? (() => NaN)).forEach((offset_s, i) => i && !Number.isNaN(offset_s) && this.#seek(i, first.time_s + offset_s, { alone: true }));
+  }
+
+  /** Show by what the recordings match now; what none of them has cannot be chosen. */
+  #showMatch() {
+    setHidden(this.matching, this.replays.length < 2);
+    if (this.replays.length < 2 || document.activeElement === this.match) return;
+    const [first] = this.replays;
+    const hasEnded = first.time_s >= first.duration_s;
+    const doMatch = (offset_s, i) => {
+      const { time_s, duration_s } = this.replays[i];
+      const away_s = time_s - Math.max(0, Math.min(duration_s, first.time_s + offset_s));
+      return Math.abs(away_s) < NEAR_S * Math.max(1, first.speed) || (hasEnded && away_s > 0);
+    };
+    const found = Object.entries(MATCHES).filter(([, [, of]], k) => {
+      const offsets_s = this.#offsets_s(of);
+      this.match.options[k].disabled = offsets_s.some(Number.isNaN);
+      return offsets_s.every(doMatch);
+    });
+    const kept = found.find(([value]) => value === this.match.value) ?? found[0];
+    this.match.value = kept ? kept[0] : BY_HAND;
+  }
+
   update(replays, outlines) {
     setHidden(this.host, !replays.length);
-    this.replays = replays;
+    [this.replays, this.outlines] = [replays, outlines];
+    this.#showMatch();
     if (!replays.length) return;
     while (this.#rows.length < replays.length) this.#rows.push(this.#row(this.#rows.length));
     this.#rows.length = replays.length;

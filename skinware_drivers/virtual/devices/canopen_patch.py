@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_a_grid
 from skinware_drivers.virtual.device import Seconds
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 
 _HEARTBEAT = "heartbeat"
 _BOOT_UP, _STOPPED, _OPERATIONAL, _PRE_OPERATIONAL = 0, 4, 5, 127

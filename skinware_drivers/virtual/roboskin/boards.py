@@ -10,15 +10,14 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from skinware_drivers.virtual.device import DATA as BURSTS
-from skinware_drivers.virtual.device import Device
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.device import Device, Transmission
+from skinware_drivers.virtual.hardware import Event
 from skinware_drivers.virtual.roboskin.converters import Converters, TriangleFaults, TriangleState
 from skinware_drivers.virtual.roboskin.firmware import TRIANGLES
 from skinware_drivers.virtual.roboskin.inertial import InertialSensors, Units
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.touch import PressedSkin, Touch, WireSource
 from skinware_drivers.virtual.stage import Stage
-from skinware_drivers.virtual.wire import Transmission
 
 POLLING, OLD_DATA, DATA, INERTIAL, BOOTLOADER = 2, 3, 4, 5, 7
 """Message classes (icub-firmware-shared:can/canProtocolLib/iCubCanProto_classes.h)."""

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from skinware_drivers.virtual.device import DATA as BURSTS
-from skinware_drivers.virtual.events import Event
+from skinware_drivers.virtual.hardware import Event
 from skinware_drivers.virtual.roboskin.boards import DATA, OLD_DATA, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
 from skinware_drivers.virtual.roboskin.inertial import MTB3_UNITS, MTB4_UNITS, Units

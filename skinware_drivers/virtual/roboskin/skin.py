@@ -16,8 +16,7 @@ from skinware.geometry import Geometry
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.virtual.device import DATA as BURSTS
 from skinware_drivers.virtual.device import Device
-from skinware_drivers.virtual.events import Event, FrameDamage, Half
-from skinware_drivers.virtual.hardware import EventLog, Point, Pressing
+from skinware_drivers.virtual.hardware import Event, EventLog, FrameDamage, Half, Point, Pressing
 from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import TriangleState
 from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES
@@ -36,7 +35,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     """Emulated boards on one bus.
 
     Args:
-        log: receives the :mod:`skinware_drivers.virtual.events`, for example a list.
+        log: receives the :mod:`skinware_drivers.virtual.hardware`, for example a list.
         source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; its 12 values
             0-255 go on the wire instead of felt ones. Flags stay true.
     """

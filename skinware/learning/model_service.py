@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -153,12 +154,15 @@ def onnx_model(path: str | Path) -> Model:
         MissingExtra: onnxruntime is not installed.
         ConfigurationError: the file is no ONNX model.
     """
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it reads this when it is imported
     try:
         import onnxruntime
     except ImportError:
-        raise MissingExtra("ONNX models need a package that is not installed: pip install onnxruntime") from None
+        raise MissingExtra("ONNX models need a package that is not installed: pip install 'skinware[onnx]'") from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1  # more of them would wait busily, beside drivers
     try:
-        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:
         raise ConfigurationError(f"{path}: no ONNX model ({error})") from error
     inputs = [each.name for each in session.get_inputs()]

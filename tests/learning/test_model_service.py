@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+import onnx
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
 from skinware import DriverReader, DriverWriter, ServiceReader, Status
-from skinware.errors import ConfigurationError, MissingExtra, StructureError
+from skinware.errors import ConfigurationError, StructureError
 from skinware.learning.model_service import ModelService, onnx_model
 from skinware.realtime import now_ns
 from skinware_drivers.testing.waiting import wait_until
@@ -95,12 +97,48 @@ def test_a_model_that_cannot_run_is_refused_at_once(tmp_path: Path) -> None:
             ModelService(lambda values, position: np.array(1 // 0), "hand")
         with pytest.raises(StructureError, match="force_z"):
             ModelService(sums, "hand", type_name="force_z")
-    try:
-        import onnxruntime
-    except ImportError:
-        with pytest.raises(MissingExtra, match="pip install onnxruntime"):
-            onnx_model(tmp_path / "model.onnx")
-        return
-    assert onnxruntime
     with pytest.raises(ConfigurationError, match="no ONNX model"):
         onnx_model(tmp_path / "model.onnx")
+
+
+def write_onnx(path: Path, window: int, taxels: int, *, with_positions: bool) -> None:
+    """The mean over the window, and where the touch is: the mean of the places, weighted by the newest values."""
+    inputs = [helper.make_tensor_value_info("values", TensorProto.FLOAT, [1, window, taxels])]
+    outputs = [helper.make_tensor_value_info("mean", TensorProto.FLOAT, [1, taxels])]
+    nodes = [helper.make_node("ReduceMean", ["values"], ["mean"], axes=[1], keepdims=0)]
+    newest = []
+    if with_positions:
+        newest = [numpy_helper.from_array(np.array(window - 1), "newest")]
+        inputs.append(helper.make_tensor_value_info("positions", TensorProto.FLOAT, [1, taxels, 3]))
+        outputs.append(helper.make_tensor_value_info("moment", TensorProto.FLOAT, [1, 3]))
+        nodes += [
+            helper.make_node("Gather", ["values", "newest"], ["last"], axis=1),
+            helper.make_node("MatMul", ["last", "positions"], ["moments"]),
+            helper.make_node("ReduceMean", ["moments"], ["moment"], axes=[1], keepdims=0),
+        ]
+    graph = helper.make_graph(nodes, "touch", inputs, outputs, newest)
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+
+
+def test_an_onnx_file_runs_over_history_and_places(tmp_path: Path) -> None:
+    for name, with_positions in (("plain", False), ("placed", True)):
+        write_onnx(tmp_path / f"{name}.onnx", 2, 15, with_positions=with_positions)
+    geometry = placed(np.column_stack([np.arange(15) * 0.01, np.zeros(15), np.zeros(15)]))
+    with DriverWriter("hand", hand().placed(geometry), rate_hz=50) as writer:
+        publish(writer, 1, now_ns())
+        for name in ("plain", "placed"):
+            model = onnx_model(tmp_path / f"{name}.onnx")
+            with (
+                ModelService(model, "hand", window=2, name=name) as service,
+                DriverReader("hand") as hands,
+                ServiceReader(name) as reader,
+            ):
+                for value in (1, 4):
+                    publish(writer, value, now_ns())
+                    service.take(hands.read())
+                sample = reader.read()
+                assert sample.column("mean").tolist() == [2.5] * 15
+                if name == "placed":
+                    assert sample.column("moment") == pytest.approx([4 * 1.05, 0, 0])
+        with pytest.raises(ConfigurationError, match=r"the model fails with zeros: .*values"):
+            ModelService(onnx_model(tmp_path / "plain.onnx"), "hand", window=3)

@@ -12,7 +12,7 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
@@ -177,6 +177,17 @@ def regions_asked_for(names: Collection[str], files: Sequence[Path]) -> Regions:
     if files and not names:
         raise click.UsageError("--regions names files of regions: choose regions with --region")
     return regions_of(files, names) if names else Regions(())
+
+
+def pairs(texts: Iterable[str], form: str, *, with_empty: bool = False) -> dict[str, str]:
+    """Return texts of the form ``KEY=VALUE`` by key; refuse others, and empty values."""
+    found = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not (key and equals and (value or with_empty)):
+            raise ConfigurationError(f"{text!r}: write {form}")
+        found[key] = value
+    return found
 
 
 def refuse_others(option: str, allowed: Collection[str]) -> None:

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._middlewares import ros2, yarp
+from skinware.cli._middlewares import foxglove, rerun, ros2, yarp
 from skinware.cli._robots import connect_option, list_robots, route
 from skinware.cli._terminal import echo, print_json, say
-from skinware.cli._viewers import foxglove, rerun
 
 if TYPE_CHECKING:
     from skinware.bridge_state import BridgeState

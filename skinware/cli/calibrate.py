@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import say
-
-if TYPE_CHECKING:
-    pass
 
 _STROKE = "stroke the whole skin with one finger"
 _PUSH = "press the skin through the reference, with forces that rise, rest and fall"

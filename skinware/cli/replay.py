@@ -9,8 +9,7 @@ import signal
 import sys
 import termios
 import tty
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,21 +122,10 @@ NAMESPACE = "replay"
 _DRAW_EVERY_S = 0.1
 
 
-@dataclass(frozen=True)
-class Playback:
-    """The part of a recording to publish, and how: options of ``skin-replay``, arguments of a ``Replayer``."""
-
-    speed: float
-    start_s: float
-    end_s: float | None
-    loop: bool
-    paused: bool
-    stays: bool
-    keeps_times: bool
-
-
-def publish_again(file: Path, names: Sequence[str], namespace: str | None, pace: Playback, as_json: bool) -> None:
-    """Publish the services of a recording until its end; the arguments are the options of ``skin-replay``."""
+def publish_again(
+    file: Path, names: Sequence[str], namespace: str | None, pace: Mapping[str, Any], as_json: bool
+) -> None:
+    """Publish the services of a recording until its end; ``pace``: arguments of :class:`Replayer`."""
     import skinware.recording
     from skinware.memory.namespace import Namespace
     from skinware.recording.replaying import Replayer
@@ -145,7 +133,7 @@ def publish_again(file: Path, names: Sequence[str], namespace: str | None, pace:
     place = Namespace(namespace or os.environ.get("SKINWARE_NAMESPACE") or NAMESPACE)
     _heed_others(place, is_chosen=bool(namespace))
     with skinware.recording.open(file) as recording:
-        replayer = Replayer(recording, names=names or None, namespace=place, **vars(pace))
+        replayer = Replayer(recording, names=names or None, namespace=place, **pace)
         terminal = Terminal(replayer)
         has_keys = not as_json and terminal.is_ours
         continued = {signal.SIGCONT: terminal.take} if has_keys else {}

@@ -23,7 +23,7 @@ if find_spec("mcap") is None or find_spec("zstandard") is None:
 
 from skinware.recording.reading import Recording
 from skinware.recording.tracks import Series, Track
-from skinware.recording.wire_tracks import WirePiece, WireTrack
+from skinware.recording.wire import WirePiece, WireTrack
 from skinware.transfer.generation import RecordedDriverSnapshot, RecordedSample, RecordedSnapshot
 from skinware.wire import WireItem
 

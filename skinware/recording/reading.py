@@ -19,7 +19,7 @@ from skinware.recording.mcap_reading import ChunkContents, ChunkPlace, Damaged, 
 from skinware.recording.timeline import GONE, Moment, Timeline
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, about_of, newer_format, service_of, wire_of
 from skinware.recording.tracks import Track
-from skinware.recording.wire_tracks import WireTrack
+from skinware.recording.wire import WireTrack
 from skinware.skin_layout import SkinLayout
 from skinware.text import nearest_name
 from skinware.transfer.collecting import LIVE, PAUSED

@@ -28,7 +28,7 @@ from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
 from skinware.recording.files import Head, PendingChunk, Target
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
-from skinware.recording.wire_tracks import message_of
+from skinware.recording.wire import message_of
 from skinware.transfer.codec import CodedColumn, FrameEncoder
 from skinware.transfer.collecting import UNREADABLE, Collector
 from skinware.transfer.generation import Generation, disguised

@@ -78,7 +78,7 @@ def command(
     from skinware_drivers.finding.running import driver_on, running_drivers
 
     place = Namespace(namespace)
-    given = dict(_pair(text) for text in arguments)
+    given = {key: _value(text) for key, text in cli.pairs(arguments, "KEY=VALUE", with_empty=True).items()}
     drivers, of_bus = running_drivers(), None
     owner = next((each for each in drivers if (each.name, each.namespace) == (target, place.name)), None)
     if owner is None and (owner := driver_on(target, drivers)) is not None:
@@ -179,12 +179,7 @@ def _adapter(
     file = ConfigFile(config)
     driver_type = driver_name or file.settings.driver or DEFAULT_DRIVER
     driver = load_driver(driver_type)
-    given = {}
-    for text in options:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise click.UsageError(f"-o {text}: write options as KEY=VALUE")
-        given[key] = value
+    given = cli.pairs(options, "-o KEY=VALUE", with_empty=True)
     adapter_class = NamedBus(bus_name, driver_type).choose(driver)
     return driver_type, adapter_class(file.options_of_bus(driver.Options, bus_name, given))
 
@@ -201,17 +196,14 @@ def _confirm(what: str, description: str, yes: bool) -> None:
         raise Declined("nothing was changed")
 
 
-def _pair(text: str) -> tuple[str, Any]:
-    """Return key and value of ``key=value``; the value is JSON, or else text."""
+def _value(text: str) -> Any:
+    """Return a value in JSON, or else the text."""
     import msgspec
 
-    key, equals, value = text.partition("=")
-    if not equals or not key.isidentifier():
-        raise click.UsageError(f"{text}: write arguments as KEY=VALUE")
     try:
-        return key, msgspec.json.decode(value)
+        return msgspec.json.decode(text)
     except msgspec.DecodeError:
-        return key, value
+        return text
 
 
 def _description(method: Any) -> str:

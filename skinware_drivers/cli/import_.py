@@ -86,8 +86,8 @@ def icub(
             paths,
             notes,
             only=only,
-            positions={name: Path(file) for name, file in _pairs(positions, "--positions PART=FILE")},
-            bus_names={_patch(patch): name for patch, name in _pairs(buses, "--bus PATCH=NAME")},
+            positions={name: Path(file) for name, file in cli.pairs(positions, "--positions PART=FILE").items()},
+            bus_names={_patch(patch): name for patch, name in cli.pairs(buses, "--bus PATCH=NAME").items()},
             wants_buses=not root,
         )
         if root:
@@ -117,16 +117,6 @@ def icub(
             f" {figures['triangles']} triangles, {figures['sensors']} sensors,"
             f" {figures['sensors_with_a_place']} with a place"
         )
-
-
-def _pairs(texts: Sequence[str], form: str) -> list[tuple[str, str]]:
-    pairs = []
-    for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals or not key or not value:
-            raise ConfigurationError(f"{text!r}: write {form}")
-        pairs.append((key, value))
-    return pairs
 
 
 def _patch(text: str) -> int:

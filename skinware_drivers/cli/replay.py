@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
-from skinware.cli.replay import NAMESPACE, Playback, publish_again
+from skinware.cli.replay import NAMESPACE, publish_again
 
 if TYPE_CHECKING:
     from skinware.recording import Recording
@@ -27,7 +27,7 @@ _FULL_S = 0.1
 _PAYLOAD = 64
 
 
-def speed(text: str) -> float:
+def speed_text(text: str) -> float:
     """Return a factor above 0; for ``click.option(type=...)``."""
     factor = cli.seconds(text)
     if not factor:
@@ -45,12 +45,12 @@ def speed(text: str) -> float:
 )
 @click.argument("file", type=cli.FILE)
 @cli.names_argument
-@click.option("--speed", "factor", type=speed, default="1", show_default=True, metavar="X", help="2: twice as fast.")
+@click.option("--speed", type=speed_text, default="1", show_default=True, metavar="X", help="2: twice as fast.")
 @click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
 @click.option("--loop", is_flag=True, help="Begin again at the end.")
 @click.option("--paused", is_flag=True, help="Wait for a key or a request first.")
-@click.option("--stay", is_flag=True, help="Pause at the end, instead of ending.")
+@click.option("--stay", "stays", is_flag=True, help="Pause at the end, instead of ending.")
 @click.option(
     "--times",
     type=click.Choice(["now", "recorded"]),
@@ -75,17 +75,12 @@ def speed(text: str) -> float:
 def command(
     file: Path,
     names: tuple[str, ...],
-    factor: float,
-    start_s: float,
-    end_s: float | None,
-    loop: bool,
-    paused: bool,
-    stay: bool,
     times: str,
     namespace: str | None,
     as_json: bool,
     wire: bool,
     buses: tuple[str, ...],
+    **pace: Any,
 ) -> None:
     """Publish the drivers and services of a recording, or only NAME..., as if they ran now.
 
@@ -95,9 +90,8 @@ def command(
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
-    pace = Playback(factor, start_s, end_s, loop, paused, stay, times == "recorded")
     if wire:
-        cli.refuse_others("--wire", {"file", "names", "factor", "start_s", "end_s", "loop", "as_json", "buses"})
+        cli.refuse_others("--wire", {"file", "names", "speed", "start_s", "end_s", "loop", "as_json", "buses"})
         if not buses:
             raise click.UsageError(
                 f"--wire needs a --bus, as vcan0; for a driver without one: skin-driver --bus replay:{file}"
@@ -106,15 +100,17 @@ def command(
         return
     if buses:
         raise click.UsageError("--bus needs --wire")
-    publish_again(file, names, namespace, pace, as_json)
+    publish_again(file, names, namespace, {**pace, "keeps_times": times == "recorded"}, as_json)
 
 
-def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace: Playback, as_json: bool) -> None:
+def _replay_wires(
+    file: Path, drivers: Sequence[str], buses: Sequence[str], pace: Mapping[str, Any], as_json: bool
+) -> None:
     import skinware.recording
 
     with skinware.recording.open(file) as recording:
         pairs = _pairs(recording, drivers, buses)
-        sender = WireSender(pairs, pace.speed, pace.start_s, pace.end_s)
+        sender = WireSender(pairs, pace["speed"], pace["start_s"], pace["end_s"])
         with contextlib.closing(sender), cli.signals_end(sender.stop):
             sender.open()
             names = {wire.bus: bus.name.removeprefix("bus ") for wire, bus in pairs}
@@ -122,7 +118,7 @@ def _replay_wires(file: Path, drivers: Sequence[str], buses: Sequence[str], pace
                 print_json({"event": "ready", "file": str(file), "buses": names, "duration_s": recording.duration_s})
             else:
                 echo(f"{file}: {', '.join(f'{one} on {other}' for one, other in names.items())} (Ctrl-C ends)")
-            sender.send_all(loop=pace.loop)
+            sender.send_all(loop=pace["loop"])
         for problem in recording.problems:
             cli.warn(problem)
     if as_json:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.source import BLOCK_BYTES, Rows
+from skinware.conversion.foreign.source import BLOCK_BYTES, ColumnSource, Rows
 from skinware.conversion.tables import package
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
@@ -25,7 +25,7 @@ _PIXELS = {"8": "u1", "16": "u2", "32": "f4", "mono8": "u1", "mono16": "u2"}
 _MOST_ROWS = 1000
 
 
-class BagSource:
+class BagSource(ColumnSource):
     """A bag: a ``.bag`` of ROS 1, a folder or an ``.mcap`` or ``.db3`` of ROS 2.
 
     Numbers in messages within messages are columns, as ``header.stamp``; lists of messages are arrays; a point cloud
@@ -38,7 +38,7 @@ class BagSource:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.share = path, 0.0
+        super().__init__(path)
         bags = package("rosbags.highlevel", "A bag of ROS")
         stores = package("rosbags.typesys", "A bag of ROS")
         self._files = ExitStack()
@@ -51,12 +51,12 @@ class BagSource:
             self.close()
             raise
         heard = {topic: first[1] for topic, first in firsts.items() if first is not None}
-        self.left_out: Mapping[str, str] = {topic: "no message" for topic in firsts if topic not in heard}
-        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+        self.left_out = {topic: "no message" for topic in firsts if topic not in heard}
+        self.tables = {
             topic: {LOG_TIME: (), **{name: np.shape(each) for name, each in _columns(message).items()}}
             for topic, message in heard.items()
         }
-        self.frames: Mapping[str, str] = {
+        self.frames = {
             topic: getattr(getattr(message, "header", None), "frame_id", "") for topic, message in heard.items()
         }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 from itertools import islice, product
 from math import prod
@@ -15,7 +15,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.source import BLOCK_BYTES, Rows
+from skinware.conversion.foreign.source import BLOCK_BYTES, ColumnSource, Rows
 from skinware.conversion.tables import package, pyarrow
 from skinware.errors import ConfigurationError
 
@@ -33,7 +33,7 @@ class _Array(NamedTuple):
     in_columns: bool
 
 
-class NpzSource:
+class NpzSource(ColumnSource):
     """An NPZ file. Arrays of equally many rows are a table: ``""``, or ``N rows`` where a file has several.
 
     Raises:
@@ -42,8 +42,7 @@ class NpzSource:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.share = path, 0.0
-        self.frames: Mapping[str, str] = {}
+        super().__init__(path)
         try:
             self._zip = zipfile.ZipFile(path)
             self._arrays = {name.removesuffix(".npy"): self._head(name) for name in self._zip.namelist()}
@@ -54,12 +53,12 @@ class NpzSource:
             for name, each in self._arrays.items()
             if each.dtype.kind in "iufbM" and each.shape and all(each.shape)
         }
-        self.left_out: Mapping[str, str] = {
+        self.left_out = {
             name: f"{each.dtype} of shape {each.shape}" for name, each in self._arrays.items() if name not in found
         }
         lengths = dict.fromkeys(each.shape[0] for each in found.values())
         self._table_of = {length: f"{length} rows" if len(lengths) > 1 else "" for length in lengths}
-        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+        self.tables = {
             table: {name: each.shape[1:] for name, each in found.items() if each.shape[0] == length}
             for length, table in self._table_of.items()
         }
@@ -121,7 +120,7 @@ def _plain(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return rows.astype("datetime64[ns]").astype(np.int64) if rows.dtype.kind == "M" else rows
 
 
-class ParquetSource:
+class ParquetSource(ColumnSource):
     """A Parquet file, or all files of a folder in the order of their names.
 
     Raises:
@@ -131,8 +130,7 @@ class ParquetSource:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.share = path, 0.0
-        self.frames: Mapping[str, str] = {}
+        super().__init__(path)
         self._arrow = pyarrow()
         self._paths = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
         self._rows = 0
@@ -148,16 +146,10 @@ class ParquetSource:
                 found = self._array(self._paths[0], name, batch.column(name))
                 if found.dtype.kind != "U":
                     shapes[name] = found.shape[1:]
-        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {"": shapes}
-        self.left_out: Mapping[str, str] = {name: kind for name, kind in kinds.items() if name not in shapes}
+        self.tables = {"": shapes}
+        self.left_out = {name: kind for name, kind in kinds.items() if name not in shapes}
 
     def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:  # noqa: ARG002, it has one
-        yield from self._batches(names)
-
-    def close(self) -> None:
-        """Do nothing: no file stays open."""
-
-    def _batches(self, names: Collection[str]) -> Iterator[Rows]:
         done = 0
         for path in self._paths:
             with self._opened(path) as file:
@@ -192,11 +184,7 @@ class ParquetSource:
 
 
 class DatasetSource(ParquetSource):
-    """A dataset of LeRobot (v3.0). Its column ``time_s`` has the episodes one after the other.
-
-    Attributes:
-        marks: ``time_s`` of the first row of each episode, and its name.
-    """
+    """A dataset of LeRobot (v3.0). Its column ``time_s`` has the episodes one after the other."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -209,17 +197,17 @@ class DatasetSource(ParquetSource):
         if not (path / "data").is_dir():
             raise ConfigurationError(f"{path}: no folder data in it: fetch the whole dataset")
         super().__init__(path / "data")
-        self.marks: list[tuple[float, str]] = []
+        marks: list[tuple[float, str]] = []
         self._begins: dict[int, float] = {}
         end_s = -_EPISODE_GAP_S
-        for rows in self._batches(["episode_index", "timestamp"]):
+        for rows in super().blocks("", ["episode_index", "timestamp"]):
             episodes, times = rows["episode_index"].ravel(), rows["timestamp"].ravel().astype(np.float64)
             for episode in dict.fromkeys(episodes.tolist()):
                 if episode not in self._begins:
                     self._begins[episode] = end_s + _EPISODE_GAP_S
-                    self.marks.append((self._begins[episode], f"episode {episode}"))
+                    marks.append((self._begins[episode], f"episode {episode}"))
                 end_s = self._begins[episode] + float(times[episodes == episode].max())
-        self.tables = {"": {**self.tables[""], TIME: ()}}
+        self.marks, self.tables = marks, {"": {**self.tables[""], TIME: ()}}
 
     def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
         needed = {*names} - {TIME} | {"episode_index", "timestamp"}

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.files import DatasetSource
 from skinware.conversion.foreign.mapping import UNITS_NS, MappedDriver, read_map
 from skinware.conversion.foreign.source import ColumnSource, Rows
 from skinware.conversion.tables import COLUMNS, Block, Table
@@ -187,9 +186,8 @@ class ImportedSource:
     @property
     def events(self) -> list[dict[str, Any]]:
         """A mark at the beginning of each episode of a dataset."""
-        marks = self.columns.marks if isinstance(self.columns, DatasetSource) else []
         found = []
-        for time_s, text in marks:
+        for time_s, text in self.columns.marks:
             time_ns = round(time_s * NS_PER_S)
             own_ns, log_ns = time_ns - self.begin_ns + _BEGIN_NS, time_ns + self.shift_ns
             found.append({"event": "mark", "service": "", "text": text, "time_ns": own_ns, "log_time_ns": log_ns})

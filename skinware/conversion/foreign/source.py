@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +17,7 @@ BLOCK_BYTES = 4 << 20
 """Size of the rows that a source reads together."""
 
 
-class ColumnSource(Protocol):
+class ColumnSource(ABC):
     """A file, or a folder of files, of another program.
 
     Attributes:
@@ -24,14 +26,19 @@ class ColumnSource(Protocol):
         left_out: by name, why something in it is no column of numbers; a column of texts can be read all the same.
         frames: by table, the name of the coordinate frame of its positions, where the source has one.
         share: part of the last pass over a table that is done, 0 to 1.
+        marks: times of episodes, s on the axis of the data, and their names.
     """
 
-    path: Path
     tables: Mapping[str, Mapping[str, tuple[int, ...]]]
     left_out: Mapping[str, str]
-    frames: Mapping[str, str]
-    share: float
+    frames: Mapping[str, str] = MappingProxyType({})
+    marks: Sequence[tuple[float, str]] = ()
+    share: float = 0.0
 
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @abstractmethod
     def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
         """Yield rows of some columns, a few at a time; each call begins again with the first.
 
@@ -40,7 +47,7 @@ class ColumnSource(Protocol):
             OSError: they cannot be read.
         """
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027, not all keep files open
         """Close the files. Idempotent."""
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.source import Rows
+from skinware.conversion.foreign.source import ColumnSource, Rows
 from skinware.errors import ConfigurationError
 
 _READ_BYTES = 1 << 20
@@ -26,7 +26,7 @@ _DUMPED = re.compile(r"\d+ \d+(\.\d+)? \S")
 _BRACKETS = str.maketrans("()", "  ")
 
 
-class TextSource:
+class TextSource(ColumnSource):
     """A text with a row of numbers in each line; an empty cell is NaN.
 
     Names of columns are in its first line; without one they are ``column_0``, ``column_1`` ... Separators are tabs,
@@ -41,8 +41,7 @@ class TextSource:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.share = path, 0.0
-        self.frames: Mapping[str, str] = {}
+        super().__init__(path)
         with path.open("rb") as file:
             lines = self._lines_of([file.readline(_READ_BYTES) for _ in range(_SAMPLE_LINES)], 0)
         self._is_dump = path.name == "data.log" and any(map(_DUMPED.match, lines[:5]))
@@ -63,7 +62,7 @@ class TextSource:
             if any(cell.strip().isdecimal() and int(cell) >= _EXACT for cell in cells)
         }
         wrong = {name: [cell for cell in cells if _number(cell) is None] for name, cells in samples.items()}
-        self.left_out: Mapping[str, str] = {
+        self.left_out = {
             name: f"{cells[0]!r} is no number"
             for name, cells in wrong.items()
             if name not in self._dates and len(cells) > len(rows) / 2
@@ -71,9 +70,7 @@ class TextSource:
         shapes = {
             name: (len(places),) if self._is_dump and name == "value" else () for name, places in self._places.items()
         }
-        self.tables: Mapping[str, Mapping[str, tuple[int, ...]]] = {
-            "": {name: shape for name, shape in shapes.items() if name not in self.left_out}
-        }
+        self.tables = {"": {name: shape for name, shape in shapes.items() if name not in self.left_out}}
 
     def blocks(self, table: str, names: Collection[str]) -> Iterator[Rows]:
         size, at, number = max(self.path.stat().st_size, 1), 0, 1
@@ -87,9 +84,6 @@ class TextSource:
                 rows = self._rows(lines, number, names)
                 yield {name: each.reshape(-1, *self.tables[table].get(name, ())) for name, each in rows}
                 number += len(read)
-
-    def close(self) -> None:
-        """Do nothing: no file stays open."""
 
     # -- the form of the text -------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from skinware.tactile.baseline import Baseline, Calm
+    from skinware.tactile.baseline import Baseline, BaselineSettings, Calm
     from skinware.tactile.chain import ChainSettings
     from skinware.tactile.contacts import Contact, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsReader
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from skinware.tactile.motion import MotionReader, MotionSet, motion_of
     from skinware.tactile.onsets import ContactEvent, EventKind
     from skinware.tactile.regions import Box, Region, Regions, put_region, read_regions
-    from skinware.tactile.rule import BaselineSettings
     from skinware.tactile.tracking import ContactKind, TrackingSettings
 
 __all__ = [
@@ -63,7 +62,6 @@ __all__ = [
 ]
 
 _MODULES = (
-    "rule",
     "baseline",
     "contacts",
     "tracking",

@@ -19,9 +19,8 @@ from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
-from skinware.tactile.baseline import Baseline, Calm
+from skinware.tactile.baseline import UNUSABLE, Baseline, BaselineSettings, Calm
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
-from skinware.tactile.rule import UNUSABLE, BaselineSettings
 from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
 from skinware.tactile.thermal import ThermalSettings
 from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of

@@ -14,9 +14,9 @@ import numpy as np
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.tactile.arrays import read_arrays, write_arrays
+from skinware.tactile.baseline import FORGET_AFTER_S
 from skinware.tactile.chain import HEALTH, Chain, ChainState
 from skinware.tactile.derived_services import CalmHealth
-from skinware.tactile.rule import FORGET_AFTER_S
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 

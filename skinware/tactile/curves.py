@@ -20,7 +20,7 @@ import numpy.typing as npt
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.tactile.arrays import Doubles, Floats
-from skinware.tactile.rule import UNUSABLE
+from skinware.tactile.baseline import UNUSABLE
 from skinware.tactile.stages import Signal, Stage, StageSettings, Taxels
 from skinware.toml_text import TomlText
 

@@ -20,6 +20,7 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware.tactile.arrays import Bytes, Flags, Floats
+from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE
 from skinware.tactile.chain import Chain
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
@@ -29,7 +30,6 @@ from skinware.tactile.motion import MotionWriter
 from skinware.tactile.neighbours import neighbours, posed
 from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
-from skinware.tactile.rule import SIGNED_TYPES, UNUSABLE
 from skinware.tactile.source_service import ServiceOptions, Source, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")

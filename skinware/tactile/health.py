@@ -23,11 +23,10 @@ from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.tactile.arrays import Bytes, Columns, Doubles, Flags, Floats, Whole, check_state
-from skinware.tactile.baseline import Calm
+from skinware.tactile.baseline import Calm, resolution_of
 from skinware.tactile.health_evidence import Dues, Noise, Use
 from skinware.tactile.health_relations import Copies, Dropouts, Twins, median_around
 from skinware.tactile.neighbours import Table, neighbours
-from skinware.tactile.rule import resolution_of
 
 _CLEAR = 8.0  # times the noise: a touch this high is no flicker
 _HARD = 0.25  # share of what a taxel usually shows at most: less is the rest of a touch, and no other touch

@@ -21,7 +21,7 @@ from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
 from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
-from skinware.tactile.rule import SIGNED_TYPES, resolution_of
+from skinware.tactile.baseline import SIGNED_TYPES, resolution_of
 
 NO_UNIT = "1"
 """Unit of values that are no quantity any more."""

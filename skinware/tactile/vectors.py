@@ -19,7 +19,7 @@ from skinware import native
 from skinware.errors import ConfigurationError
 from skinware.native import give_arrays, read_structs
 from skinware.tactile.arrays import Doubles, Flags, Floats
-from skinware.tactile.rule import FORGET_AFTER_S
+from skinware.tactile.baseline import FORGET_AFTER_S
 from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxels
 
 AXES = (

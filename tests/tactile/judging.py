@@ -12,8 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.baseline import Baseline
-from skinware.tactile.rule import BaselineSettings
+from skinware.tactile.baseline import Baseline, BaselineSettings
 from skinware.tactile.testing import Cover, Gesture, Push, Stroke, World, grid
 from tests.tactile.bench import BENCH_S, bench_world
 from tests.tactile.peers import CapSense, ICub, Judged, QTouch, Rule, TareOnce

@@ -17,8 +17,7 @@ from skinware import DriverReader, Status
 from skinware.errors import ConfigurationError, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.status import Why
-from skinware.tactile.baseline import Baseline, Calm
-from skinware.tactile.rule import BaselineSettings
+from skinware.tactile.baseline import Baseline, BaselineSettings, Calm
 from skinware.tactile.testing import World, grid
 from tests.cli.fake_skin import FakeSkin
 

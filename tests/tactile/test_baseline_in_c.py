@@ -7,8 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from skinware.status import Status
-from skinware.tactile.baseline import Baseline, Calm
-from skinware.tactile.rule import BaselineSettings
+from skinware.tactile.baseline import Baseline, BaselineSettings, Calm
 from skinware.tactile.testing import World, grid
 from tests.specification.baseline import SpecifiedBaseline
 from tests.tactile.bench import bench_world

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinware.tactile.baseline import Baseline
+from skinware.tactile.baseline import Baseline, BaselineSettings
 from skinware.tactile.contacts import Contacts, ContactSet
 from skinware.tactile.neighbours import neighbours
-from skinware.tactile.rule import BaselineSettings
 from skinware.tactile.testing import Response, World, grid
 from tests.tactile.skins import PITCH_M, placed
 

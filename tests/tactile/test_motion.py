@@ -7,11 +7,10 @@ import numpy.typing as npt
 import pytest
 
 from skinware._columns import Index
-from skinware.tactile.baseline import Baseline
+from skinware.tactile.baseline import Baseline, BaselineSettings
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.motion import MotionSet, motion_of
 from skinware.tactile.neighbours import neighbours
-from skinware.tactile.rule import BaselineSettings
 from skinware.tactile.testing import Response, World, grid
 from tests.tactile.skins import AT_ONCE, PITCH_M, placed
 

@@ -13,11 +13,10 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.baseline import Baseline
+from skinware.tactile.baseline import Baseline, BaselineSettings
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.motion import motion_of
 from skinware.tactile.neighbours import NONE, neighbours
-from skinware.tactile.rule import BaselineSettings
 from skinware.tactile.testing import Gesture, Response, Stroke, World, grid
 from tests.tactile.skins import placed
 

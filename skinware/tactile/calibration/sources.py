@@ -13,9 +13,9 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
 from skinware.structure import Structure
 from skinware.tactile.arrays import Doubles
+from skinware.tactile.baseline import UNUSABLE
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.curves import temperature_of
-from skinware.tactile.rule import UNUSABLE
 
 POINT, POSE = "point_m", "pose"
 """Columns of a service of poses: (3,) or (k, 3) points, m; (4, 4) pose of the carrier of a finger, homogeneous, m."""

@@ -3,8 +3,7 @@
 It gives arrays, so that an algorithm can be compared with the load that no real skin knows: docs/tactile/world.md.
 """
 
-from skinware.tactile.testing.gestures import Cover, Gesture, Play, Push, Stroke, Wander, read_stage
-from skinware.tactile.testing.response import Response
+from skinware.tactile.testing.gestures import Cover, Gesture, Play, Push, Response, Stroke, Wander, read_stage
 from skinware.tactile.testing.surface import ARM_FRAME, Surface, arm, arm_path, grid, triangles
 from skinware.tactile.testing.world import Block, Sample, World
 

@@ -12,9 +12,8 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware.tactile.arrays import Bytes, Doubles, Flags, Floats, Whole
-from skinware.tactile.rule import UNUSABLE
-from skinware.tactile.testing.gestures import Cover, Gesture, How, Push, Stroke
-from skinware.tactile.testing.response import Faults, Jump, Missing, Response
+from skinware.tactile.baseline import UNUSABLE
+from skinware.tactile.testing.gestures import Cover, Faults, Gesture, How, Jump, Missing, Push, Response, Stroke
 from skinware.tactile.testing.surface import Surface, Taxels
 
 _START_NS = 1_000_000_000

@@ -11,7 +11,7 @@ One question decides everything: how much of this could be drift? Each taxel has
 is. A value that is above the offset by more than noise and uncertainty explain is a touch. Under a touch the offset is
 predicted from what the patch has in common, and its uncertainty grows by the drift that was measured at rest. A touch
 lasts until its load is gone, or has fallen to what drift could be. All times are those of the frames.
-:mod:`.rule` has all numbers.
+:mod:`.numbers` has all numbers.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware.status import Why
-from skinware.tactile.baseline import Calm
-from skinware.tactile.rule import BaselineSettings
+from skinware.tactile.baseline import BaselineSettings, Calm
 from tests.specification.baseline.numbers import (
     ALIKE,
     EPSILON,

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
-from skinware.tactile.rule import BaselineSettings
+from skinware.tactile.baseline import BaselineSettings
 from tests.specification.baseline.numbers import BLOCK_FRAMES, BLOCKS, ENOUGH_BLOCKS, GAIN_SPREAD2, MOVED_SHARE
 from tests.specification.baseline.offsets import Grouping
 

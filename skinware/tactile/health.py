@@ -231,6 +231,7 @@ class Health:
         self._dropouts = Dropouts(self._neighbours)
         self._copies, self._twins = Copies(self._module, self._neighbours), Twins(self._neighbours)
         self._clear = _CLEAR * self._least_noise  # a touch above it is clear
+        self._is_misled = np.zeros(n, bool)  # shows touches of others, which says nothing of taxels beside it
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, settings: HealthSettings | None = None) -> Self:
@@ -262,9 +263,10 @@ class Health:
             self._dropouts.forget(self.settings.noise_s)
             shown = self._dues.share_shown(self.settings.touches)
             self._dues.exchanges.watch(np.flatnonzero(shown < self.settings.weak))
+            self._is_misled = self._related(shown)[0] > 0
         self._dropouts.add(self._now_s, self._use.value, given, at_end, calm, far)
         self._use.add(self._now_s, self._now_s - before_s, given, calm)
-        hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual))
+        hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual)) & ~self._is_misled
         above = given - calm.baseline
         self._dues.add(self._now_s, above, calm, hard)
         self._copies.add(self._now_s, given, calm.usable, self._clear / _CLEAR)

@@ -145,7 +145,7 @@ class Dues:
         due, shown: sums over the touches so far of due squared, and of due times shown; older ones count less.
         touches, hard_touches: separate touches of both sides, and those to which much was due.
         recent: the mean share of the last hard touches, each with the same weight.
-        best: the largest of these means so far; 0 before it is known well.
+        best: the largest of these means so far, at most 1; 0 before it is known well.
         exchanges: weak taxels that show what is due to others.
     """
 
@@ -198,7 +198,7 @@ class Dues:
         count = np.minimum(self.hard_touches[ended], _RECENT_TOUCHES)
         self.recent[ended] += (shown[hard] / due[hard] - self.recent[ended]) / count
         settled = ended[count == _RECENT_TOUCHES]
-        self.best[settled] = np.maximum(_BEST_KEPT * self.best[settled], self.recent[settled])
+        self.best[settled] = np.maximum(_BEST_KEPT * self.best[settled], np.minimum(self.recent[settled], 1))
 
 
 class Pairs:

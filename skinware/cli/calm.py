@@ -140,12 +140,8 @@ def _report_ready(service: CalmService, as_json: bool) -> None:
         return
     structure = chain.structure
     units = {sensor_type.name: sensor_type.unit for sensor_type in structure.types}
-    contacts, health = service.contacts, service.health
-    beside = {  # empty: there is none
-        "contacts": contacts.name if contacts is not None else "",
-        "motion": contacts.motion.name if contacts is not None and contacts.motion is not None else "",
-        "health": health.name if health is not None else "",
-    }
+    of_service = {"contacts": service.contacts, "motion": service.motion, "health": service.health}
+    beside = {kind: derived.name for kind, derived in of_service.items()}  # empty: there is none
     if as_json:
         ready: dict[str, Any] = {"event": "ready", "driver": "calm", "name": service.name}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}

@@ -23,7 +23,7 @@ from skinware.tactile.baseline import Baseline
 from skinware.tactile.calm_driver import CalmedDriver, DriverSource
 from skinware.tactile.chain import Chain, ChainSettings
 from skinware.tactile.chain_state import LearnedState
-from skinware.tactile.derived_services import CalmContacts, CalmHealth
+from skinware.tactile.derived_services import CalmContacts, CalmHealth, CalmMotion
 from skinware.tactile.motion import NAME as MOTION
 from skinware.tactile.regions import Regions
 
@@ -114,8 +114,7 @@ class CalmService:
     Attributes:
         frames: number of frames that were taken.
         restored: number of sensors that went on with what the file had.
-        contacts: the service of its contacts; None: there is none.
-        health: the service of its health; None: there is none.
+        contacts, motion, health: the services beside it.
 
     Raises:
         ConfigurationError: both namespaces are the same, or a bad name.
@@ -143,10 +142,10 @@ class CalmService:
             raise ConfigurationError(f"{name!r} is in namespace {self.into.name!r} itself: give another with --into")
         self.frames = 0
         self.restored = 0
-        self.contacts = None
-        if contacts:
-            self.contacts = CalmContacts(contacts, name, self.into, group, regions, motion, poses)
-        self.health = CalmHealth(health, name, self.into, group) if health else None
+        self.contacts = CalmContacts(contacts, name, self.into, group, poses)
+        moving = (motion, regions) if regions is not None else ("", Regions(()))
+        self.motion = CalmMotion(moving[0], name, self.into, group, moving[1], self.contacts)
+        self.health = CalmHealth(health, name, self.into, group)
         self._settings = settings or ChainSettings.calm()
         self._learned = LearnedState(state_path, self.health)
         self._requests = CalmRequests(name)
@@ -189,9 +188,8 @@ class CalmService:
                     report()
         finally:
             self._learned.close(self.chain)
-            for end in (self.contacts, self.health, self._calmed, self._source):
-                if end is not None:
-                    end.close()
+            for end in (self.motion, self.contacts, self.health, self._calmed, self._source):
+                end.close()
 
     def stop(self) -> None:
         """End ``run`` within some 50 ms."""
@@ -216,8 +214,8 @@ class CalmService:
             "refused": {name: stage.baseline.refused_share for name, stage in stages.items()},
             "touched": {name: int(stage.touched.sum()) for name, stage in stages.items()},
             "why": {name: count_reasons(stage.calm.why) for name, stage in stages.items() if stage.calm is not None},
-            "contacts": 0 if self.contacts is None else self.contacts.count,
-            "faulty": 0 if self.health is None else self.health.faulty,
+            "contacts": 0 if self.contacts.newest is None else len(self.contacts.newest[0]),
+            "faulty": self.health.faulty,
         }
 
     def _follow(self, frame: DriverSnapshot) -> None:
@@ -227,9 +225,8 @@ class CalmService:
         learned = None if before is None else self._learned.state(before)
         rate_hz = NS_PER_S / frame.period_ns if frame.period_ns else None
         self._calmed.follow(chain.structure, self._source.reader, rate_hz)
-        for derived in (self.contacts, self.health):
-            if derived is not None:
-                derived.follow(chain, rate_hz)
+        for derived in (self.contacts, self.motion, self.health):
+            derived.follow(chain, rate_hz)
         restored = self._learned.restore(chain, learned)
         self.restored = restored if before is None else self.restored
         self._requests.chain, self._state = chain, "waiting"
@@ -247,12 +244,11 @@ class CalmService:
             return False
         chain.step(frame, columns["values"], columns["status"])
         chain.explain(columns["uncertainty"], columns["why"])
-        if self.health is not None:
-            self.health.step(columns["status"], frame.acquired_ns)
+        self.health.step(columns["status"], frame.acquired_ns)
         self._warn(chain)
         writer.commit(frame.acquired_ns)
-        if self.contacts is not None:
-            self.contacts.publish(columns["values"], columns["status"], frame.acquired_ns)
+        self.contacts.publish(columns["values"], columns["status"], frame.acquired_ns)
+        self.motion.publish(frame.acquired_ns)
         self._requests.published(frame.acquired_ns, writer)
         before, self._state = self._state, "running"
         return before == "waiting"
@@ -264,8 +260,9 @@ class CalmService:
             return
         self._state = "lost"
         self._calmed.publish_stale()
-        if self.contacts is not None:
-            self.contacts.publish_none(now_ns())
+        time_ns = now_ns()
+        self.contacts.publish_none(time_ns)
+        self.motion.publish(time_ns)
 
     def _warn(self, chain: Chain) -> None:
         """Warn once of the sensors of each type that wait for their baselines, and that a touch seems to lower."""

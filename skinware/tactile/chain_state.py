@@ -64,19 +64,16 @@ def default_path(namespace: str, name: str) -> Path:
 
 
 class LearnedState:
-    """Keeps what one chain has learned, and what is known of its health (None: nothing), in a file (None: in none)."""
+    """Keeps what one chain has learned, and what is known of its health, in a file (None: in none)."""
 
-    def __init__(self, path: Path | None, health: CalmHealth | None) -> None:
+    def __init__(self, path: Path | None, health: CalmHealth) -> None:
         self._path, self._health = path, health
         self._saving: threading.Thread | None = None
         self._next_save_ns = now_ns() + _SAVE_EVERY_NS
 
     def state(self, chain: Chain) -> ChainState:
-        """Return all of it."""
-        state = chain.state()
-        if self._health is None or self._health.judged is None:
-            return state
-        return replace(state, arrays=state.arrays | self._health.judged.state())
+        state, judged = chain.state(), self._health.judged
+        return state if judged is None else replace(state, arrays=state.arrays | judged.state())
 
     def restore(self, chain: Chain, state: ChainState | None = None) -> int:
         """Let a new chain, which its health follows already, go on with a state, or else with that in the file.
@@ -92,7 +89,7 @@ class LearnedState:
         try:
             if state is not None:
                 restored = chain.restore(state)
-                if self._health is not None and self._health.judged is not None:
+                if self._health.judged is not None:
                     self._health.judged.restore(state)
         except ConfigurationError as error:
             why = f"{self._path}: {error}"

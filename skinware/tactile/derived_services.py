@@ -25,12 +25,11 @@ from skinware.tactile.chain import Chain
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
-from skinware.tactile.motion import NAME as MOTION
 from skinware.tactile.motion import MotionWriter
 from skinware.tactile.neighbours import neighbours, posed
 from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
-from skinware.tactile.source_service import ServiceOptions, Source, SourceWriter
+from skinware.tactile.source_service import ServiceOptions, SourceWriter
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -42,12 +41,13 @@ _HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
 class DerivedService(ABC, Generic[WriterT]):
     """A service beside a calmed driver, computed from its frames.
 
-    If another program has a service of this name, the name of the driver and a hyphen come before it.
+    If another program has a service of this name, the name of the driver and a hyphen come before it. Without a name
+    there is none.
     """
 
     kind: ClassVar[str]
 
-    def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
+    def __init__(self, name: str | None, driver: str, into: Namespace, group: str | None = None) -> None:
         self._name, self._driver = name, driver
         self._options: ServiceOptions = {"namespace": into, "group": group}
         self.writer: WriterT | None = None
@@ -59,8 +59,9 @@ class DerivedService(ABC, Generic[WriterT]):
 
     def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
         """Go on with another chain, of other sensors, at the nominal rate of the driver."""
-        with self._or_none():
-            self._follow(chain, rate_hz)
+        if self._name:
+            with self._or_none():
+                self._follow(chain, rate_hz)
 
     @abstractmethod
     def _follow(self, chain: Chain, rate_hz: float | None) -> None: ...
@@ -148,40 +149,32 @@ def _length(axes: list[Floats]) -> Floats:
 
 
 class CalmContacts(DerivedService[ContactsWriter]):
-    """The contacts of one calmed driver, and (``motion``) the motion of regions if there are any.
+    """The contacts of one calmed driver.
 
     They are found in pressures, or else in another type that a touch only raises, or else in the lengths of vectors.
-    Poses of coordinate frames on the robot, (4, 4) by name, let contacts hang together across their borders.
+    Poses of coordinate frames on the robot, (4, 4) by name, let contacts hang together across their borders. ``newest``
+    are those of the newest frame, and the (n,) loads in which they were found; None: there are none.
     """
 
     kind = "contacts"
 
     def __init__(
         self,
-        name: str,
+        name: str | None,
         driver: str,
         into: Namespace,
         group: str | None = None,
-        regions: Regions | None = None,
-        motion: str = MOTION,
         poses: Mapping[str, npt.ArrayLike] | None = None,
     ) -> None:
         super().__init__(name, driver, into, group)
-        self.count = 0
-        self.motion = None if regions is None else CalmMotion(motion, driver, into, group, regions)
+        self.newest: tuple[ContactSet, Floats] | None = None
         self._poses = poses or {}
         self._loads: Loads | None = None
 
-    def follow(self, chain: Chain, rate_hz: float | None = None) -> None:
-        super().follow(chain, rate_hz)
-        if self.motion is not None:
-            self.motion.source = None if self.writer is None else self.writer.source
-            self.motion.follow(chain, rate_hz)
-
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
-        self._loads, self.count = Loads.of(chain), 0
+        self._loads, self.newest = Loads.of(chain), None
         if self._loads is None:
-            super().close()
+            self.close()
             return
         structure, type_name, beside = chain.structure, self._loads.type_name, None
         if structure.geometry is not None and self._poses:
@@ -189,7 +182,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
         if self.writer is not None and self.writer.source.type_name == type_name:
             self.writer.go_on(structure, neighbours=beside)
         else:
-            super().close()
+            self.close()
             more = {"driver": self._driver, "neighbours": beside, "rate_hz": rate_hz}
             self._open(ContactsWriter, structure, type_name, **more)
 
@@ -200,10 +193,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
         usable, loads = self._loads.usable(status), self._loads.values(values)
         more = self._loads.more(usable, self.writer.source.unit)
         with self._or_none():
-            found = self.writer.publish(loads, self._loads.touched & usable, acquired_ns, **more)
-            self.count = len(found)
-            if self.motion is not None:
-                self.motion.publish(found, loads, acquired_ns)
+            self.newest = self.writer.publish(loads, self._loads.touched & usable, acquired_ns, **more), loads
 
     def publish_none(self, time_ns: int) -> None:
         """Publish that nothing is touched, as the driver is dead."""
@@ -213,31 +203,38 @@ class CalmContacts(DerivedService[ContactsWriter]):
 
     def close(self) -> None:
         super().close()
-        self.count = 0
-        if self.motion is not None:
-            self.motion.close()
+        self.newest = None
 
 
 class CalmMotion(DerivedService[MotionWriter]):
-    """The motion of the regions of one calmed driver, beside its contacts of this ``source``; None: there are none."""
+    """The motion of regions of one calmed driver, by its contacts."""
 
     kind = "motion"
 
-    def __init__(self, name: str, driver: str, into: Namespace, group: str | None, regions: Regions) -> None:
+    def __init__(
+        self,
+        name: str | None,
+        driver: str,
+        into: Namespace,
+        group: str | None,
+        regions: Regions,
+        contacts: CalmContacts,
+    ) -> None:
         super().__init__(name, driver, into, group)
-        self.source: Source | None = None
-        self._regions = regions
+        self._regions, self._contacts = regions, contacts
 
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
         self.close()
-        if self.source is not None:
-            given = chain.structure, self.source.type_name, self._regions, self.source.frames
+        if self._contacts.writer is not None:
+            source = self._contacts.writer.source
+            given = chain.structure, source.type_name, self._regions, source.frames
             self._open(MotionWriter, *given, driver=self._driver, rate_hz=rate_hz)
 
-    def publish(self, contacts: ContactSet, values: Floats, acquired_ns: int) -> None:
-        if self.writer is not None:
+    def publish(self, acquired_ns: int) -> None:
+        """Publish the motion of the newest contacts."""
+        if self.writer is not None and self._contacts.newest is not None:
             with self._or_none():
-                self.writer.publish(contacts, values, acquired_ns)
+                self.writer.publish(*self._contacts.newest, acquired_ns)
 
 
 class CalmHealth(DerivedService[HealthWriter]):
@@ -250,7 +247,7 @@ class CalmHealth(DerivedService[HealthWriter]):
 
     kind = "health"
 
-    def __init__(self, name: str, driver: str, into: Namespace, group: str | None = None) -> None:
+    def __init__(self, name: str | None, driver: str, into: Namespace, group: str | None = None) -> None:
         super().__init__(name, driver, into, group)
         self.faulty = 0
         self.judged: ChainHealth | None = None

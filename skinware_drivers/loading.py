@@ -19,7 +19,7 @@ import skinware
 from skinware.errors import ConfigurationError
 from skinware.memory.namespace import check_name
 from skinware.text import nearest_name
-from skinware_drivers.options.declared import SOURCE_SUFFIX, is_file
+from skinware_drivers.options import SOURCE_SUFFIX, is_file
 
 _OURS = tuple(os.path.dirname(file) + os.sep for file in (__file__, skinware.__file__))
 _PYTHONS, _INSTALLED = sysconfig.get_path("stdlib"), sysconfig.get_path("purelib")  # the second may lie in the first

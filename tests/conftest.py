@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, settings
 
 from skinware.memory.namespace import Namespace
-from skinware_drivers.testing.leaks import files_left
+from skinware_drivers.testing.plugin import files_left
 
 # other things run beside the tests: how long an example takes says nothing
 settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -14,8 +14,8 @@ from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, kind_of_bus
 from skinware_drivers.bus_names import BusPlace
 from skinware_drivers.cli.capturing import driver_of_recording, only_listened, options_of_recording
+from skinware_drivers.cli.driver_file import ConfigFile, DriverConfig
 from skinware_drivers.loading import short_name
-from skinware_drivers.options.file import ConfigFile, DriverConfig
 from skinware_drivers.registry import DEFAULT_DRIVER, NamedBus, load_driver
 from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.guard import hook

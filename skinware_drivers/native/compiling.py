@@ -10,9 +10,8 @@ import numpy as np
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.decoding.compiled import CompiledCycle
+from skinware_drivers.decoding.compiled import CompiledCycle, FrameKind
 from skinware_drivers.decoding.decoder import Decoder
-from skinware_drivers.decoding.frame_kind import FrameKind
 from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import Above, Byte, Packed, Sentinel, SequenceNumber, StatusBytes
 from skinware_drivers.layout import Expand, Frame

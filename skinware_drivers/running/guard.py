@@ -1,6 +1,6 @@
 """Decide what a failure costs, by one rule.
 
-* An ``Expand`` function fails: the frame is lost, and counted as bad content (``decoding.frame_kind``).
+* An ``Expand`` function fails: the frame is lost, and counted as bad content (``decoding.compiled``).
 * A device fails (``BusError`` or ``OSError`` in a hook): the attempt is repeated, for its patch or its bus.
 * A bus fails, whatever its methods raise: it is closed, and opened again (``BusLine.lose``).
 * The driver's own code fails in a hook of one bus: that bus is set aside while another one is served (``Serving``).

@@ -17,7 +17,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter, check_layout
 from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.testing.comparison import until_fresh
-from skinware_drivers.testing.leaks import Belongings, files_left
+from skinware_drivers.testing.plugin import Belongings, files_left
 from skinware_drivers.testing.rig import Running, Suite, in_its_time, play
 from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.virtual.hand_clock import HandClock

@@ -21,7 +21,7 @@ from skinware_drivers.decoding.decoder import Updates, read_numbers
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
-from skinware_drivers.running.path_hooks import Named
+from skinware_drivers.running.native_path import Named
 from skinware_drivers.testing.comparison import ShownUpdates, until_fresh
 from skinware_drivers.testing.rig import Running, Suite, in_its_time
 from skinware_drivers.testing.vectors import DirectPath

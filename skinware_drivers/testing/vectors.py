@@ -40,8 +40,7 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.master import Listener
 from skinware_drivers.polling import Watch
-from skinware_drivers.running.native_path import NativePath
-from skinware_drivers.running.path_hooks import Named
+from skinware_drivers.running.native_path import Named, NativePath
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.testing.clock import run_in_its_time

@@ -18,7 +18,7 @@ from skinware.bridge.serving import Server
 from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.testing.leaks import files_left
+from skinware_drivers.testing.plugin import files_left
 from tests.bridge.net import Net, NetLink
 
 ROBOT = "walle"

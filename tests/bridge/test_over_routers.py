@@ -17,7 +17,7 @@ from skinware.bridge import Rules, endpoints
 from skinware.errors import ConfigurationError, RequestFailed
 from skinware.memory.namespace import Namespace
 from skinware.service import ServiceReader, ServiceWriter
-from skinware_drivers.testing.leaks import files_left
+from skinware_drivers.testing.plugin import files_left
 from skinware_drivers.testing.waiting import wait_until
 from tests.bridge.test_over_zenoh import certificates, driver
 from tests.commands import PATIENCE_S, Running, run, running

@@ -20,7 +20,7 @@ from skinware import DriverReader, DriverWriter
 from skinware.errors import RequestFailed
 from skinware.memory.announcement import sweep
 from skinware.memory.namespace import Namespace
-from skinware_drivers.testing.leaks import files_left
+from skinware_drivers.testing.plugin import files_left
 from skinware_drivers.testing.waiting import wait_until
 from tests.bridge.rig import publish, structure
 from tests.bridge.slow import slow_link

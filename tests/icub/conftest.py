@@ -7,9 +7,9 @@ from tempfile import NamedTemporaryFile
 
 import pytest
 
+from skinware_drivers.cli.driver_file import ConfigFile
 from skinware_drivers.icub.importer import Import, import_files
 from skinware_drivers.icub.xml_tree import Note, Notes
-from skinware_drivers.options.file import ConfigFile
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

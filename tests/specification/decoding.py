@@ -15,9 +15,8 @@ import numpy.typing as npt
 from skinware.samples import Unused
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Form, KeyField
-from skinware_drivers.decoding.compiled import NO_KIND, CompiledCycle
+from skinware_drivers.decoding.compiled import NO_KIND, Assembly, CompiledCycle
 from skinware_drivers.decoding.decoder import NONE_YET, PATCH_COUNTERS, Decoder, SkinState, Updates, read_numbers
-from skinware_drivers.decoding.frame_kind import Assembly
 from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import Byte, Flag, SequenceNumber
 from skinware_drivers.layout import Layout

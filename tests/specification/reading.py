@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.decoding.frame_kind import Assembly, FrameKind
+from skinware_drivers.decoding.compiled import Assembly, FrameKind
 from skinware_drivers.fields import Above, Flag, Packed, Sentinel, StatusBytes
 from skinware_drivers.layout import Expand, Values
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skinware_drivers.virtual.roboskin.firmware import Arithmetic, ArrayI, FirmwareSample
+from skinware_drivers.virtual.roboskin.converters import Arithmetic, FirmwareSample
+from skinware_drivers.virtual.roboskin.touch import ArrayI
 
 BASE = 0x9000
 

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from skinware.realtime import NS_PER_S
-from skinware_drivers.virtual.roboskin.firmware import Arithmetic
+from skinware_drivers.virtual.roboskin.converters import Arithmetic
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET, Touch
 
 from .rig import Rig, cycles

@@ -38,7 +38,7 @@ from skinware import DriverReader, DriverWriter, Namespace
 from skinware.errors import Overrun, ServiceNotFound, ServiceTimeout, SkinwareError, StructureChanged
 from skinware.realtime import NS_PER_S, Periodic, now_ns
 from skinware.status import age_limit_ns
-from skinware_drivers.testing.leaks import Belongings
+from skinware_drivers.testing.plugin import Belongings
 from tests.bridge.net import Net
 from tests.bridge.rig import joining, publish, serving, structure
 from tests.bridge.slow import SlowLink

@@ -18,9 +18,8 @@ from typing import ClassVar, Literal
 
 from skinware_drivers.virtual.device import DATA as BURSTS
 from skinware_drivers.virtual.hardware import Event
-from skinware_drivers.virtual.roboskin.boards import DATA, OLD_DATA, EmulatedBoard
+from skinware_drivers.virtual.roboskin.boards import DATA, MTB3_UNITS, MTB4_UNITS, OLD_DATA, EmulatedBoard, Units
 from skinware_drivers.virtual.roboskin.converters import DEFAULT_NO_LOAD, DEFAULT_SKIN_TYPE
-from skinware_drivers.virtual.roboskin.inertial import MTB3_UNITS, MTB4_UNITS, Units
 from skinware_drivers.virtual.roboskin.touch import DEFAULT_CDC_OFFSET
 
 _MTB3_BYTES = {0x07: 2, 0x1C: 3, 0x32: 2, 0x4C: 8, 0x4D: 4, 0x4E: 7, 0x4F: 3, 0x50: 7}

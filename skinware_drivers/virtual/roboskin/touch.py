@@ -17,11 +17,16 @@ from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.tactile.testing import ARM_FRAME, Wander, World, arm, arm_path, read_stage
 from skinware_drivers.virtual.hardware import Point, Pressing
-from skinware_drivers.virtual.roboskin.firmware import CHANNELS, TRIANGLES, ArrayI
 from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 
 if TYPE_CHECKING:  # needs MuJoCo
     from skinware_drivers.virtual.physics.world import PhysicsWorld
+
+TRIANGLES = 16
+"""Triangles a board can carry."""
+CHANNELS = 12
+"""Channels of a triangle: one AD7147 capacitance-to-digital converter."""
+ArrayI = npt.NDArray[np.int64]
 
 WireSource = Callable[[int, int, int, int], Sequence[int]]
 """(board address, triangle, cycle, time in ns) -> the 12 values on the wire, 0-255, instead of felt ones."""

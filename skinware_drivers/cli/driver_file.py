@@ -29,7 +29,7 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import Profile
 from skinware.text import nearest_name
 from skinware.toml_text import Keys, TomlText, wrong_value
-from skinware_drivers.options.declared import is_file, options_from_strings
+from skinware_drivers.options import is_file, options_from_strings
 
 T = TypeVar("T", bound=msgspec.Struct)
 

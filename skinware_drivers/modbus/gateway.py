@@ -11,14 +11,14 @@ import ipaddress
 import select
 import socket
 from abc import ABC, abstractmethod
-from collections import deque
+from collections import defaultdict, deque
 
 from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import FramerCounters
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.wire import Message
-from skinware_drivers.running.guard import Backoff
+from skinware_drivers.running.guard import Backoff, pauses_of_device
 from skinware_drivers.serial.ports import Port, PtyPort
 from skinware_drivers.streams.bus import Address, parse_address, reason_of
 from skinware_drivers.streams.tcp import TcpPort
@@ -33,22 +33,6 @@ _SILENCE_NS = NS_PER_S // 20
 _HERE = "127.0.0.1"
 _NO_SUCH_FUNCTION, _BAD_VALUE, _NO_WAY, _NO_ANSWER = 1, 3, 10, 11
 _EVERY_UNIT = 0
-_PATIENT_TIMES = 3
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
-
-
-class Retry:
-    """Space the attempts at something that fails again and again: none before ``until_ns``."""
-
-    def __init__(self) -> None:
-        self.times = 0
-        self.until_ns = 0
-        self._pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
-
-    def failed(self, time_ns: int) -> None:
-        self.times += 1
-        if self.times >= _PATIENT_TIMES:
-            self.until_ns = time_ns + round(self._pauses.next_s() * NS_PER_S)
 
 
 class Guest(ABC):
@@ -78,7 +62,7 @@ class Guests:
         self._guests: list[Guest] = []  # the one that was served longest ago comes first
         self._open: tuple[Guest, Message] | None = None
         self._has_written = False
-        self._silent: dict[int, Retry] = {}
+        self._silent: defaultdict[int, Backoff] = defaultdict(pauses_of_device)
 
     @property
     def are_waiting(self) -> bool:
@@ -107,7 +91,7 @@ class Guests:
             self._guests.append(guest)
             question = guest.waiting.popleft()
             retry = self._silent.get(question.unit)
-            if retry is not None and time_ns < retry.until_ns:
+            if retry is not None and time_ns < retry.not_before_ns:
                 self._refuse(guest, question, _NO_ANSWER)
                 self._refuse_first(guest)
                 continue
@@ -129,7 +113,7 @@ class Guests:
             return
         guest, question = self._open
         if reply is None:
-            self._silent.setdefault(question.unit, Retry()).failed(time_ns)
+            self._silent[question.unit].begin(time_ns)
             self.give_up()
             return
         self._open = None

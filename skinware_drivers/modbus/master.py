@@ -6,16 +6,16 @@ Both take bytes and return bytes and rows. They read no clock and know no port, 
 from __future__ import annotations
 
 import logging
-from collections import deque
-from collections.abc import Hashable
+from collections import defaultdict, deque
 from typing import NamedTuple
 
 from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.gateway import Guests, Retry
+from skinware_drivers.modbus.gateway import Guests
 from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
 from skinware_drivers.modbus.wire import Message
+from skinware_drivers.running.guard import Backoff, pauses_of_device
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -66,7 +66,7 @@ class Schedule:
         self.questions = [Message(read.unit, read.question) for read in reads]
         self.cycle, self.cycle_ns, self.deadline_ns = -1, begun_ns, begun_ns
         self.next = len(reads)
-        self.retries: dict[Hashable, Retry] = {}
+        self.retries: defaultdict[tuple[str, int], Backoff] = defaultdict(pauses_of_device)
         self._period_ns = period_ns
 
     @property
@@ -90,17 +90,14 @@ class Schedule:
                 return position
         return None
 
-    def retry(self, kind: str, number: int) -> Retry:
-        return self.retries.setdefault((kind, number), Retry())
-
     def _rests(self, position: int, time_ns: int) -> bool:
         """Return whether a read has failed again and again, and there are others to ask for."""
         own, unit = self.retries.get(("read", position)), self.reads[position].unit
-        if own is not None and time_ns < own.until_ns and len(self.reads) > 1:
+        if own is not None and time_ns < own.not_before_ns and len(self.reads) > 1:
             return True
         of_unit = self.retries.get(("unit", unit))
         others = any(other.unit != unit for other in self.reads)
-        return others and of_unit is not None and time_ns < of_unit.until_ns
+        return others and of_unit is not None and time_ns < of_unit.not_before_ns
 
 
 class Master:
@@ -268,8 +265,8 @@ class Master:
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
             self._again, self._free_ns = asked, time_ns + _BUSY_NS
             return
-        retry = self._schedule.retry("read", asked.read)
-        if not retry.times:
+        retry = self._schedule.retries["read", asked.read]
+        if not retry.begun:
             read = self._schedule.reads[asked.read]
             what = f"unit {read.unit}, {read.count} registers from {read.address}"
             advice = ""
@@ -279,13 +276,13 @@ class Master:
             elif code == wire.NO_REGISTERS and read.address >= _MANUALS_COUNT_FROM:
                 advice = "; addresses count from 0: a manual's 30001 or 40001 is 0"
             log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), advice)
-        retry.failed(time_ns)
+        retry.begin(time_ns)
 
     def _give_up(self, asked: Open, time_ns: int) -> None:
         self._open = None
         self._counters.polls_unanswered += 1
         if asked.read >= 0:
-            self._schedule.retry("unit", asked.message.unit).failed(time_ns)
+            self._schedule.retries["unit", asked.message.unit].begin(time_ns)
         if asked.read == _GUEST:
             self._guests.answer(None, time_ns)
         self._late, self._free_ns = asked, time_ns + self._timing.timeout_ns

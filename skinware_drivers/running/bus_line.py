@@ -328,7 +328,7 @@ def are_patches(found: Iterable[object]) -> Sequence[Patch]:
 
 
 def _attempts() -> Backoff:
-    return Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S, at_once=True)
+    return Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S, free=1)
 
 
 def _failure(bus: str, method: str, error: Exception) -> BusNotAvailable:

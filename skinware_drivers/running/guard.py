@@ -113,20 +113,19 @@ class Backoff:
     """Pauses between attempts, each twice as long as the one before.
 
     Args:
-        at_once: the first attempt needs no pause.
+        free: the first so many attempts need no pause.
 
     Attributes:
         begun: number of attempts since :meth:`begin_again`, where :meth:`begin` counts them.
         not_before_ns: when the next one is due, CLOCK_MONOTONIC ns.
     """
 
-    def __init__(self, first_s: float, longest_s: float, *, at_once: bool = False) -> None:
-        self._first_s, self._longest_s = first_s, longest_s
-        self._begin_s = 0.0 if at_once else first_s
+    def __init__(self, first_s: float, longest_s: float, *, free: int = 0) -> None:
+        self._first_s, self._longest_s, self._free = first_s, longest_s, free
         self.begin_again()
 
     def begin_again(self) -> None:
-        self._next_s = self._begin_s
+        self._next_s, self._left = self._first_s, self._free
         self.begun = self.not_before_ns = 0
 
     def begin_again_after(self, passed_ns: int) -> None:
@@ -135,14 +134,22 @@ class Backoff:
             self.begin_again()
 
     def next_s(self) -> float:
-        pause_s, self._next_s = self._next_s, min(2 * self._next_s or self._first_s, self._longest_s)
+        if self._left:
+            self._left -= 1
+            return 0.0
+        pause_s, self._next_s = self._next_s, min(2 * self._next_s, self._longest_s)
         return pause_s
 
     @property
     def is_due(self) -> bool:
         return now_ns() >= self.not_before_ns
 
-    def begin(self) -> None:
-        """Count an attempt, after which a pause begins."""
+    def begin(self, time_ns: int | None = None) -> None:
+        """Count an attempt, after which a pause begins: now, or at the time of a caller that reads no clock."""
         self.begun += 1
-        self.not_before_ns = now_ns() + round(self.next_s() * NS_PER_S)
+        self.not_before_ns = (now_ns() if time_ns is None else time_ns) + round(self.next_s() * NS_PER_S)
+
+
+def pauses_of_device() -> Backoff:
+    """Return the pauses of a device that is asked: from its third failure in a row on, it is asked less often."""
+    return Backoff(0.25, 2.0, free=2)

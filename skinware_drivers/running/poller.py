@@ -12,14 +12,11 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.fields import Match
 from skinware_drivers.link import Link
 from skinware_drivers.polling import Poll
-from skinware_drivers.running.guard import Backoff
+from skinware_drivers.running.guard import pauses_of_device
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _LOOK_AGAIN_S = 0.05
-_PATIENT_TIMES = 3
-"""Missing answers in a row before a device is asked less often."""
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.25, 2.0
 _ROOM, _LONGEST_EXTRA_S = 1.25, 1.0
 """The next time, an answer is awaited for this multiple of its delay, and at most so much longer."""
 
@@ -37,17 +34,7 @@ class _Place:
         self.timer = timer
         self.asked_ns = 0
         self.extra_s = 0.0
-        self.pauses = Backoff(_FIRST_PAUSE_S, _LONGEST_PAUSE_S)
-        self.answered()
-
-    def answered(self) -> None:
-        self._missing = 0
-        self.pauses.begin_again()
-
-    def unanswered(self) -> None:
-        self._missing += 1
-        if self._missing >= _PATIENT_TIMES:
-            self.pauses.begin()
+        self.pauses = pauses_of_device()
 
 
 class Poller:
@@ -123,7 +110,7 @@ class Poller:
         place.timer.advance(time_ns)
         place.asked_ns = time_ns
         if is_away:
-            place.answered()  # unknown
+            place.pauses.begin_again()  # unknown
             return
         if len(asked) > 1 and not place.pauses.is_due:
             return
@@ -148,14 +135,14 @@ class Poller:
             on_late=lambda late_s: self._count_late(poll, place, late_s),
         )
         if came:
-            place.answered()
+            place.pauses.begin_again()
         else:
             self._counters.polls_unanswered += 1
-            place.unanswered()
+            place.pauses.begin()
 
     def _count_late(self, poll: Poll, place: _Place, late_s: float) -> None:
         """Count an answer after its timeout: the device lives, at a pace of its own."""
-        place.answered()
+        place.pauses.begin_again()
         if late_s <= 0:
             return  # it came in time, and was read late
         self._counters.polls_late += 1

@@ -26,7 +26,6 @@ from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import (
-    EmulatedBus,
     Interference,
     Pattern,
     Truth,
@@ -62,7 +61,7 @@ class Rig:
         self.devices: Any = suite.emulator(options, log=None, source=self.truth)
         self.numbers: list[int] = list(self.devices.numbers)
         self.wire: Interference = Interference(self.devices)
-        self.bus: EmulatedBus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
+        self.bus = make_bus(self.adapter, self.wire, clock, listen_only=listen_only)
 
     @property
     def period_ns(self) -> int:

@@ -47,7 +47,8 @@ from skinware_drivers.testing.clock import run_in_its_time
 from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import make_bus
 from skinware_drivers.virtual.hand_clock import HandClock
-from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
+from skinware_drivers.virtual.hardware import EmulatedHardware
+from skinware_drivers.virtual.recorded_wire import RecordedWire
 
 _MS = 1_000_000
 _WHY = dict(
@@ -249,32 +250,13 @@ def _feed(
         yield from (f"{name}: {_WHY[BUS_COUNTERS[which]]}" for which in np.flatnonzero(counters - before))
 
 
-class _NoDevices:
-    """Hardware that never sends."""
-
-    def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        pass
-
-    def next_due_ns(self) -> int | None:
-        return None
-
-    def emit(self, now_ns: int) -> list[WireFrame]:  # noqa: ARG002
-        return []
-
-    def skip(self, now_ns: int) -> int:  # noqa: ARG002
-        return 0
-
-    def totals(self) -> dict[str, int]:
-        return {}
-
-
 def _patches(adapter: AnyAdapter, devices: EmulatedHardware | None) -> Sequence[Patch]:
     if type(adapter).describe is Adapter.describe:
         return adapter.patches
     clock = HandClock()
 
     async def describe() -> Sequence[Patch]:
-        bus = make_bus(adapter, devices or _NoDevices(), clock, listen_only=False)
+        bus = make_bus(adapter, devices or RecordedWire(iter(()), 0), clock, listen_only=False)
         adapter.fit(bus)
         async with attended(bus) as link:
             try:

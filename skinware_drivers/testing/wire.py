@@ -13,7 +13,7 @@ import numpy.typing as npt
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.testing.waiting import defect
-from skinware_drivers.virtual.bus import VirtualCanBus, VirtualModbusBus, VirtualSerialBus
+from skinware_drivers.virtual.bus import BUSES, EmulatedBus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
 
@@ -222,17 +222,8 @@ class Interference:
         return round(self.every_ns * self._random.uniform(0.6, 1.4))
 
 
-EmulatedBus = VirtualCanBus | VirtualSerialBus | VirtualModbusBus
-_KINDS: dict[str, type[EmulatedBus]] = {
-    "can": VirtualCanBus,
-    "virtual": VirtualCanBus,
-    "serial": VirtualSerialBus,
-    "modbus": VirtualModbusBus,
-}
-
-
 def make_bus(adapter: AnyAdapter, hardware: EmulatedHardware, clock: HandClock, *, listen_only: bool) -> EmulatedBus:
-    kind = _KINDS.get(adapter.medium)
+    kind = BUSES.get(adapter.medium)
     if kind is None:
         return defect(f"{type(adapter).__name__}: there is no emulated bus of the medium {adapter.medium!r}")
     return kind(

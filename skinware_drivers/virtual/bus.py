@@ -348,11 +348,20 @@ class EmulatedPort(Port):
         self._timer.wake_at(0 if self._unread else self._hardware.next_due_ns())
 
 
+BUSES: dict[str, type[EmulatedBus]] = {
+    "can": VirtualCanBus,
+    "virtual": VirtualCanBus,
+    "serial": VirtualSerialBus,
+    "modbus": VirtualModbusBus,
+}
+"""The emulated bus of each medium."""
+
+
 def _class_of(channel: str, _options: object) -> type[Bus]:
     emulator = load_emulator(channel or DEFAULT_EMULATOR)
-    kinds: dict[str, type[Bus]] = {"serial": VirtualSerialBus, "modbus": VirtualModbusBus}
+    kind = BUSES.get(medium_of(emulator), VirtualCanBus)
     has_places = isinstance(emulator, type) and issubclass(emulator, PlacedHardware)
-    return kinds.get(medium_of(emulator), PlacedCanBus if has_places else VirtualCanBus)
+    return PlacedCanBus if has_places and kind is VirtualCanBus else kind
 
 
 @chosen_by(_class_of)

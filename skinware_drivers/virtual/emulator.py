@@ -74,7 +74,7 @@ class Emulator(Stage[OptionsT]):
 
     Args:
         options: of the devices, what they feel, and their faults.
-        log: receives the :mod:`.events`, for example a list.
+        log: receives each :class:`.hardware.Event`, for example a list.
         source: the values of every burst, instead of felt ones.
 
     Attributes:

@@ -1,7 +1,7 @@
 """An emulated ROBOSKIN: MTB3 and MTB4 patch controllers on one CAN wire, which obey the real commands.
 
 The boards are silent until a host starts them, or the option ``streaming`` does as if one had. Their commands are in
-:mod:`.mtb`, their arithmetic in :mod:`.firmware`, their touch in :mod:`.touch`.
+:mod:`.mtb`, their arithmetic in :mod:`.converters`, their touch in :mod:`.touch`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     """Emulated boards on one bus.
 
     Args:
-        log: receives the :mod:`skinware_drivers.virtual.hardware`, for example a list.
+        log: receives each :class:`skinware_drivers.virtual.hardware.Event`, for example a list.
         source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; its 12 values
             0-255 go on the wire instead of felt ones. Flags stay true.
     """

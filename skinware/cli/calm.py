@@ -140,8 +140,11 @@ def _report_ready(service: CalmService, as_json: bool) -> None:
         return
     structure = chain.structure
     units = {sensor_type.name: sensor_type.unit for sensor_type in structure.types}
-    of_service = {"contacts": service.contacts, "motion": service.motion, "health": service.health}
-    beside = {kind: derived.name for kind, derived in of_service.items()}  # empty: there is none
+    beside = {  # empty: there is none
+        "contacts": service.contacts.name,
+        "motion": service.motion.name,
+        "health": service.health.name,
+    }
     if as_json:
         ready: dict[str, Any] = {"event": "ready", "driver": "calm", "name": service.name}
         counts = {"sensors": structure.n_sensors, "modules": structure.n_modules, "patches": structure.n_patches}

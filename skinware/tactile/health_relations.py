@@ -167,7 +167,8 @@ class Copies:
         self._frames += 1
         if now_s - self._before_s < _CHANGE_S:
             return
-        mean, clear = self._sum / np.float32(self._frames), _CLEAR_CHANGE * noise * math.sqrt(2 / self._frames)
+        mean = (self._sum / self._frames).astype(np.float32)
+        clear = _CLEAR_CHANGE * noise * math.sqrt(2 / self._frames)
         change = np.nan_to_num(mean - self._before)
         self._before, self._before_s, self._frames = mean, now_s, 0
         self._sum[:] = 0

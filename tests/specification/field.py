@@ -62,11 +62,13 @@ class _Array:
 
     @property
     def live(self) -> Flags:
-        return self.state != State.NONE
+        live: Flags = self.state != State.NONE
+        return live
 
     @property
     def explained(self) -> Flags:
-        return (self.state == State.REST) | (self.state == State.STEADY)
+        explained: Flags = (self.state == State.REST) | (self.state == State.STEADY)
+        return explained
 
     def at_rest(self) -> int:
         return int((self.state == State.REST).sum())

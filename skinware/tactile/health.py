@@ -182,7 +182,7 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clipped: float = 0.5
     dead: float = 0.1
     weak: float = 0.25
-    dying: float = 0.5
+    dying: float = 0.45
     dropouts: float = 5.0
     crosstalk: float = 0.05
 
@@ -274,10 +274,10 @@ class Health:
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""
-        settings, use = self.settings, self._use
-        shown = self._dues.share_shown(settings.touches)
+        settings, use, dues = self.settings, self._use, self._dues
+        shown = dues.share_shown(settings.touches)
         shown_around = median_around(self._neighbours, shown, settings.weak)
-        kept = np.where(self._dues.best > 0, self._dues.recent, math.nan) / np.fmax(self._dues.best, 1e-9)
+        kept = np.where(dues.best > 0, np.minimum(dues.recent, 1), math.nan) / np.fmax(dues.best, 1e-9)
         typical = self._typical_noise()
         noise, at_end = self._noise.deviation, self._noise.at_end
         noise_times = noise / np.float32(typical or math.nan)
@@ -292,7 +292,7 @@ class Health:
         kind = np.zeros(len(still_s), np.uint8)
         for name, where in (
             (HealthKind.NEVER_TOUCHED, use.seen & (use.peak <= _CLEAR * np.fmax(noise, typical))),
-            (HealthKind.WEAK, weak & (self._dues.touches >= 2 * settings.touches)),
+            (HealthKind.WEAK, weak & (dues.touches >= 2 * settings.touches)),
             (HealthKind.DYING, kept < settings.dying * median_around(self._neighbours, kept, settings.dying)),
             (HealthKind.DEAD, dead),
             (HealthKind.CROSSTALK, shows_other == HealthKind.CROSSTALK),
@@ -312,11 +312,11 @@ class Health:
             "noise": noise,
             "noise_times": noise_times,
             "clipped": at_end,
-            "touches": self._dues.touches,
+            "touches": dues.touches,
             "shown": shown,
             "shown_around": shown_around,
-            "recent": np.where(self._dues.hard_touches > 0, self._dues.recent, math.nan),
-            "best": np.where(self._dues.best > 0, self._dues.best, math.nan),
+            "recent": np.where(dues.hard_touches > 0, dues.recent, math.nan),
+            "best": np.where(dues.best > 0, dues.best, math.nan),
             "dropouts": self._dropouts.count,
             "other": other,
             "other_shown": other_shown,

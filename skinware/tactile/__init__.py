@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from skinware.tactile.chain import ChainSettings
     from skinware.tactile.contacts import Contact, Contacts, ContactSet
     from skinware.tactile.contacts_service import ContactsReader
-    from skinware.tactile.curves import read_curves
     from skinware.tactile.health import Health, HealthKind, HealthReport, HealthSettings
     from skinware.tactile.health_service import HealthReader
     from skinware.tactile.motion import MotionReader, MotionSet, motion_of
@@ -57,7 +56,6 @@ __all__ = [
     "TrackingSettings",
     "motion_of",
     "put_region",
-    "read_curves",
     "read_regions",
 ]
 
@@ -66,7 +64,6 @@ _MODULES = (
     "contacts",
     "tracking",
     "regions",
-    "curves",
     "chain",
     "health",
     "motion",

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from skinware import native
-from skinware.tactile import rule
+from skinware.tactile import baseline
 
 _TEXT = Path(native.__file__).with_name("baseline.h").read_text()
 _NUMBERS = {
@@ -14,7 +14,7 @@ _NUMBERS = {
 }
 _NUMBERS["GAIN_SPREAD"] = _NUMBERS["GAIN_SPREAD2"] ** 0.5
 _NUMBERS["ENOUGH_BLOCKS"] /= _NUMBERS["BLOCKS"]
-_NUMBERS["FORGET_AFTER_S"] = rule.FORGET_AFTER_S
+_NUMBERS["FORGET_AFTER_S"] = baseline.FORGET_AFTER_S
 
 
 def __getattr__(name: str) -> float:

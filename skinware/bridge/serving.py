@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -44,7 +43,7 @@ from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
-from skinware.realtime import NS_PER_S, boot, now_ns
+from skinware.realtime import boot
 from skinware.service import ServiceReader
 from skinware.transfer.codec import CodedColumn
 from skinware.transfer.collecting import Collector
@@ -54,7 +53,6 @@ _MOST_FRAMES = 1024
 """Frames that wait to be coded."""
 _CALLS_AT_ONCE, _MOST_CALLS, _CALL_S = 4, 64, 30.0
 _OPERATIONS_S = 1.0
-_SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
 _STATES: dict[str, State] = {"restarted": "live", "found": "live"}
 _STATES |= {state: state for state in get_args(State)}
 """State of a service after an event."""
@@ -296,14 +294,7 @@ class Server:
         try:
             arguments = read_text(question.payload, dict[str, Any]) if question.payload else {}
             with ServiceReader[Sample](name, namespace=self._namespace, announce=False) as reader:
-                pending = reader.ask(operation, **arguments)
-                until_ns, pause_s = now_ns() + round(_CALL_S * NS_PER_S), _SHORTEST_PAUSE_S
-                while not pending.done() and now_ns() < until_ns:
-                    if self._is_ending:
-                        pending.cancel()
-                    time.sleep(pause_s)
-                    pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-                answer = pending.result(0.0)
+                answer = reader.ask(operation, **arguments).result(_CALL_S, lambda: self._is_ending)
         except Exception as error:  # noqa: BLE001, the caller gets it
             other: _ErrorKind = "failed" if isinstance(error, RequestError) else "refused"
             result = CallResult(error=str(error)[:_LONGEST_LINE], why=_ERRORS.get(type(error), other))

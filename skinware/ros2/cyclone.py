@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import threading
@@ -120,49 +119,38 @@ def _configuration(interfaces: Sequence[str]) -> str:
 
 
 class WaitingThread:
-    """A thread that makes ``event`` readable when there is something to read, and waits again once ``go_on`` is set.
+    """A thread that calls ``woke`` whenever there is something to read, until it ``is_over``.
 
-    Threads of Cyclone DDS itself would wait for the interpreter. This one reads nothing.
+    Threads of Cyclone DDS itself would wait for the interpreter.
     """
 
-    def __init__(self, participant: DomainParticipant, reader: Any) -> None:
-        self.event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+    def __init__(self, participant: DomainParticipant, woke: Callable[[], None]) -> None:
         self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
         self._conditions: dict[Any, ReadCondition] = {}
         self._waitset.attach(self._woken)
-        self.watch(reader)
-        self.go_on, self._is_over = threading.Event(), False
+        self._woke, self.is_over = woke, False
         self._thread = threading.Thread(target=self._run, name="skinware dds", daemon=True)
         self._thread.start()
 
     def watch(self, reader: Any) -> None:
-        """Wake up for what this reader has, too."""
         self._conditions[reader] = condition = ReadCondition(reader, _NEW)
         self._waitset.attach(condition)
 
     def forget(self, reader: Any) -> None:
         self._waitset.detach(self._conditions.pop(reader))
 
-    def calm_down(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            os.eventfd_read(self.event)
+    def end(self) -> None:
+        self.is_over = True
+        self._woken.set(True)
 
     def close(self) -> None:
-        if self._is_over:
-            return
-        self._is_over = True
-        self._woken.set(True)
-        self.go_on.set()
+        self.end()
         self._thread.join()
         for condition in (*self._conditions.values(), self._woken):
             self._waitset.detach(condition)
         self._conditions.clear()
-        os.close(self.event)
 
     def _run(self) -> None:
-        while not self._is_over:
+        while not self.is_over:
             self._waitset.wait(duration(infinite=True))
-            self.go_on.clear()
-            os.eventfd_write(self.event, 1)
-            if not self._is_over:
-                self.go_on.wait()
+            self._woke()

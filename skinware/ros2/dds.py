@@ -20,16 +20,7 @@ from skinware.ros2.transport import Cdr, Handler, MessageType, NodeIdentity, Qos
 if find_spec("cyclonedds") is None:
     raise MissingExtra("ROS 2 over DDS needs packages that are not installed: pip install 'skinware[ros2]'")
 
-from cyclonedds.core import (
-    DDSException,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-    WaitSet,
-)
-from cyclonedds.domain import DomainParticipant
+from cyclonedds.core import DDSException
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl import types as idl
 from cyclonedds.pub import DataWriter
@@ -37,10 +28,9 @@ from cyclonedds.qos import Policy
 from cyclonedds.qos import Qos as DdsQos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
-from cyclonedds.util import duration
 
 from skinware.ros2 import cyclone
-from skinware.ros2.cyclone import join, reason, struct_type
+from skinware.ros2.cyclone import WaitingThread, join, reason, struct_type
 from skinware.ros_types import Definitions
 
 _SERVICE_QOS = Qos(depth=10)
@@ -69,7 +59,8 @@ class DdsNode:
         self._lock = threading.RLock()
         self._writers: list[_DdsWriter] = []
         self._services: list[_DdsService] = []
-        self._worker: _RequestThread | None = None
+        self._answering = threading.Lock()
+        self._waiting: WaitingThread | None = None
         self._info = self._writer(DISCOVERY_TOPIC, messages.PARTICIPANT, Qos(depth=1, latched=True), is_listed=False)
         self._publish_endpoints()
 
@@ -82,16 +73,20 @@ class DdsNode:
         with self._lock:
             reader = self._declare(DataReader, f"rq{name}Request", service_type.request, _SERVICE_QOS, with_id=True)
             writer = self._writer(f"rr{name}Reply", service_type.response, _SERVICE_QOS, with_id=True)
-            if self._worker is None:
-                self._worker = _RequestThread(self._participant)
-            service = _DdsService(reader, writer, handler, self._worker)
-            self._services.append(service)
+            if self._waiting is None:
+                self._waiting = WaitingThread(self._participant, self._answer)
+            service = _DdsService(reader, writer, handler)
+            with self._answering:
+                self._services.append(service)
+            self._waiting.watch(reader)
             self._publish_endpoints()
 
         def end() -> None:
             with self._lock:
-                if service in self._services:
-                    self._services.remove(service)
+                if service in self._services and self._waiting is not None:
+                    with self._answering:
+                        self._services.remove(service)
+                    self._waiting.forget(reader)
                     service.close()
                     self._publish_endpoints()
 
@@ -99,15 +94,21 @@ class DdsNode:
 
     def close(self) -> None:
         with self._lock:
-            if self._worker is not None:
-                self._worker.close()
+            if self._waiting is not None:
+                self._waiting.close()
             for service in self._services:
                 service.close()
             for writer in list(self._writers):
                 writer.close()
             self._services.clear()
             self._info.close()
-            self._participant = self._domain = self._worker = None
+            self._participant = self._domain = self._waiting = None
+
+    def _answer(self) -> None:
+        with self._answering:
+            for service in self._services:
+                if self._waiting is not None and not self._waiting.is_over:
+                    service.answer()
 
     def _writer(
         self,
@@ -203,16 +204,11 @@ class _DdsWriter:
 
 
 class _DdsService:
-    def __init__(self, reader: DataReader[Any], writer: _DdsWriter, handler: Handler, worker: _RequestThread) -> None:
-        self._reader: DataReader[Any] | None = reader
-        self._writer, self._handler, self._worker = writer, handler, worker
+    def __init__(self, reader: DataReader[Any], writer: _DdsWriter, handler: Handler) -> None:
+        self._reader, self._writer, self._handler = reader, writer, handler
         self.id: bytes = reader.guid.bytes
-        self._condition = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Alive)
-        worker.attach(self._condition, self.answer)
 
     def answer(self) -> None:
-        if self._reader is None:
-            return
         try:
             requests = self._reader.take(_REQUESTS_AT_ONCE)
         except DDSException:
@@ -225,44 +221,8 @@ class _DdsService:
                 self._writer.publish(answer[:_ENCAPSULATION] + asked[_ENCAPSULATION:after_id] + answer[_ENCAPSULATION:])
 
     def close(self) -> None:
-        self._worker.detach(self._condition)
-        self._reader = self._condition = None
+        del self._reader
         self._writer.close()
-
-
-class _RequestThread:
-    def __init__(self, participant: DomainParticipant) -> None:
-        self._waitset, self._woken = WaitSet(participant), GuardCondition(participant)
-        self._waitset.attach(self._woken)
-        self._lock = threading.Lock()
-        self._answers: dict[ReadCondition, Callable[[], None]] = {}
-        self._ended = False
-        self._thread = threading.Thread(target=self._run, name="skinware ros2 requests", daemon=True)
-        self._thread.start()
-
-    def attach(self, condition: ReadCondition, answer: Callable[[], None]) -> None:
-        with self._lock:
-            self._answers[condition] = answer
-            self._waitset.attach(condition)
-
-    def detach(self, condition: ReadCondition) -> None:
-        with self._lock:
-            if self._answers.pop(condition, None) is not None:
-                self._waitset.detach(condition)
-
-    def close(self) -> None:
-        self._ended = True
-        self._woken.set(True)
-        self._thread.join()
-        self._answers.clear()
-
-    def _run(self) -> None:
-        while not self._ended:
-            self._waitset.wait(duration(infinite=True))
-            with self._lock:
-                for answer in self._answers.values():
-                    if not self._ended:
-                        answer()
 
 
 @cache

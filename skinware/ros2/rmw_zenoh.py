@@ -102,11 +102,6 @@ class ZenohNode:
         self._worker.start()
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> TopicPublisher:
-        """Return a publisher of an absolute topic.
-
-        Raises:
-            BridgeError: there cannot be such a publisher.
-        """
         at = key(self._identity, topic, message_type)
         token = self._endpoint_token(EndpointKind.PUBLISHER, topic, message_type, qos)
         with _as_bridge_error(topic):
@@ -116,14 +111,6 @@ class ZenohNode:
         return made
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
-        """Answer requests under an absolute name, one after the other; ten may wait, more are refused.
-
-        Returns:
-            A function that ends the service; it waits for a request that is being answered.
-
-        Raises:
-            BridgeError: there cannot be such a service.
-        """
         at = key(self._identity, name, service_type)
         token = self._endpoint_token(EndpointKind.SERVICE, name, service_type, _SERVICE_QOS)
         made = _ZenohService(at, handler, self._answering, self._endpoints.discard)
@@ -135,7 +122,6 @@ class ZenohNode:
         return made.close
 
     def close(self) -> None:
-        """Leave the graph. Idempotent; waits for a request that is being answered."""
         for endpoint in tuple(self._endpoints):
             endpoint.close()
         self._jobs.put(None)
@@ -201,11 +187,9 @@ class _ZenohPublisher:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether there are subscribers; always True for a latched topic."""
         return self._is_open and (self._qos.latched or bool(self._publisher.matching_status.matching))
 
     def publish(self, message: Cdr) -> bool:
-        """Send a message; return False if it is closed. A slow subscriber misses messages."""
         if not self._is_open:
             return False
         self._sequence += 1
@@ -248,7 +232,6 @@ class _ZenohService:
         return None
 
     def close(self) -> None:
-        """End it, after the request that is being answered. Idempotent."""
         was_open, self._is_open = self._is_open, False
         with self._answering:
             if was_open:

@@ -12,7 +12,7 @@ from skinware.conversion import ros_messages
 from skinware.conversion.showing import Showing, in_topic
 from skinware.conversion.tables import sensor_names
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import NamespaceError, RequestTimeout
+from skinware.errors import NamespaceError
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, period_ns, short_turns
@@ -31,7 +31,6 @@ GONE = "gone"
 """State of a driver that was withdrawn."""
 _LIFE_NS = NS_PER_S // 5
 _TARE_S = 10.0
-_SHORTEST_PAUSE_S, _LONGEST_PAUSE_S = 0.0002, 0.02
 _LEVEL_OF_LIFE = {SILENT: DiagnosticLevel.STALE, PAUSED: DiagnosticLevel.WARN, DEAD: DiagnosticLevel.ERROR}
 _LEVEL_OF_BUS = {
     BusState.LIVE.name.lower(): DiagnosticLevel.OK,
@@ -320,15 +319,7 @@ class Ros2Server:
         """Tare a driver; return the response, also that of a driver that cannot be tared."""
         try:
             with ServiceReader(driver, namespace=self._live.namespace, announce=False) as reader:
-                pending = reader.ask("tare")
-                until_ns, pause_s = now_ns() + round(_TARE_S * NS_PER_S), _SHORTEST_PAUSE_S
-                while not pending.done():
-                    if self._stopping or now_ns() > until_ns:
-                        pending.cancel()
-                        raise RequestTimeout(f"no answer within {_TARE_S:g} s; it may have been carried out")
-                    time.sleep(pause_s)
-                    pause_s = min(2 * pause_s, _LONGEST_PAUSE_S)
-                pending.result(0.0)
+                reader.ask("tare").result(_TARE_S, lambda: self._stopping)
         except Exception as error:  # noqa: BLE001, the caller gets it
             return trigger_response(False, str(error))
         return trigger_response(True, "")

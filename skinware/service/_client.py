@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import select
 import socket
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -52,8 +53,8 @@ class PendingRequest:
         self._client.listen(0.0)
         return self._answer is not None
 
-    def result(self, timeout_s: float) -> Answer:
-        """Wait for the answer.
+    def result(self, timeout_s: float, is_over: Callable[[], bool] = lambda: False) -> Answer:
+        """Wait for the answer, unless ``is_over``: then the request is cancelled.
 
         Raises:
             RequestTimeout: none came in time; the request is then cancelled.
@@ -63,6 +64,8 @@ class PendingRequest:
         deadline_ns = now_ns() + round(timeout_s * NS_PER_S)
         answer = self._answer
         while answer is None:
+            if is_over():
+                self.cancel()
             remaining_ns = deadline_ns - now_ns()
             self._client.listen(max(0, min(remaining_ns, WAIT_SLICE_NS)) / NS_PER_S)
             answer = self._answer

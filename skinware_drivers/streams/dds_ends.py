@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
@@ -66,14 +67,16 @@ class DdsPort(TopicPort):
         self._unjudged: deque[TopicSource] = deque()
         self._rejected = 0
         self._domain, self._participant = _joined(name, domain, options)
+        self._event, self._go_on = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC), threading.Event()
         self._readers: dict[int, DataReader] = {}
         with _as_bus_error(name):
             self._publications = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-            self._waiting = WaitingThread(self._participant, self._publications)
+            self._waiting = WaitingThread(self._participant, self._woke)
+            self._waiting.watch(self._publications)
         self.change(topics)
 
     def fileno(self) -> int:
-        return self._waiting.event
+        return self._event
 
     def change(self, topics: Sequence[DdsTopic]) -> None:
         self.topics, self._rejected = topics, 0
@@ -91,7 +94,8 @@ class DdsPort(TopicPort):
         Raises:
             BusNotAvailable: the participant cannot be used any more.
         """
-        self._waiting.calm_down()
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self._event)
         time_ns = now_ns()
         self.look(time_ns)
         with _as_bus_error(self._name):
@@ -99,14 +103,24 @@ class DdsPort(TopicPort):
             rejected = sum(reader.get_sample_rejected_status().total_count for reader in self._readers.values())
         self.dropped += rejected - self._rejected
         self._rejected = rejected
-        self._waiting.go_on.set()
+        self._go_on.set()
         return b"".join(records)
 
     def close(self) -> None:
+        self._waiting.end()
+        self._go_on.set()
         self._waiting.close()
+        os.close(self._event)
         self._readers.clear()
         del self._publications, self._participant
         self._domain = None
+
+    def _woke(self) -> None:
+        """Make the descriptor readable in the waiting thread, which waits again after the next ``read``."""
+        self._go_on.clear()
+        os.eventfd_write(self._event, 1)
+        if not self._waiting.is_over:
+            self._go_on.wait()
 
     def judge(self, time_ns: int) -> None:
         """Add news of publishers that no reader has matched a while after they came."""

@@ -16,6 +16,7 @@ from skinware.structure import Structure
 from skinware.tactile.arrays import Bytes, Columns, Doubles, Flags, Floats, Whole, rows_of
 from skinware.tactile.neighbours import Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
+from skinware.tactile.slips import Slips
 from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
 from skinware.tactile.tracks import TouchedBlobs
 
@@ -47,6 +48,7 @@ class Contact:
         frame: name of the coordinate frame, empty if it is not known.
         velocity_m_s: (3,) m/s, velocity of the centre; NaN without places.
         kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
+        slips: its pattern moves along the skin by more than noise and the change of its load explain.
         provisional: only its last frames speak for it; the baseline has not confirmed it, and its load is 0.
         clipped: number of its taxels that are at the end of their range: load and force are too small.
         load_whole: estimate of the load with what threshold and clipping cut off, as of a bell; NaN if most is cut off.
@@ -66,6 +68,7 @@ class Contact:
     frame: str
     velocity_m_s: Floats
     kind: ContactKind
+    slips: bool
     provisional: bool
     clipped: int
     load_whole: float
@@ -98,6 +101,7 @@ class ContactSet:
     frame: npt.NDArray[np.int16]
     velocity_m_s: Floats
     kind: Bytes
+    slips: Bytes
     provisional: Bytes
     clipped: npt.NDArray[np.uint32]
     load_whole: Floats
@@ -115,6 +119,7 @@ class ContactSet:
         return Contact(
             frame=self.frames[frame] if frame >= 0 else "",
             kind=ContactKind(self.kind[row]),
+            slips=bool(self.slips[row]),
             provisional=bool(self.provisional[row]),
             taxels=np.flatnonzero(self.contact_of == row),
             **{name: getattr(self, name)[row].item() for name in _NUMBERS},
@@ -153,11 +158,12 @@ COLUMNS: Columns = {
     "velocity_m_s": ("<f4", (3,), "m/s", "of its centre"),
     "frame": ("<i2", (), "", "row of frame_name; -1: not known"),
     "kind": ("u1", (), "", "0: a touch, 1: a hold, 2: sliding"),
+    "slips": ("u1", (), "", "1: its pattern moves by more than noise and load explain"),
     "provisional": ("u1", (), "", "1: only its last frames speak for it, and its load is 0"),
 }
 """Dtype, shape, unit (None: that of the values) and meaning, per contact, of each array of a :class:`ContactSet`."""
 _VECTORS = [name for name, (_, shape, *_) in COLUMNS.items() if shape]
-_NUMBERS = [name for name in COLUMNS if name not in ("frame", "kind", "provisional", *_VECTORS)]
+_NUMBERS = [name for name in COLUMNS if name not in ("frame", "kind", "slips", "provisional", *_VECTORS)]
 
 
 class Contacts:
@@ -204,6 +210,7 @@ class Contacts:
         pitch = pitch_m(geometry)
         median_m = float(np.nanmedian(pitch)) if np.isfinite(pitch).any() else np.nan
         self._tracker = Tracker(self._of_taxel[:, :3], median_m, tracking)
+        self._slips = Slips(self._of_taxel[:, :3], median_m)
 
     @classmethod
     def of(
@@ -237,6 +244,7 @@ class Contacts:
         onset: Flags | None = None,
         clipped: Flags | None = None,
         uncertainty: npt.NDArray[Any] | None = None,
+        sigmas: npt.NDArray[Any] | None = None,
     ) -> ContactSet:
         """Return the contacts of the next frame.
 
@@ -247,6 +255,8 @@ class Contacts:
             onset: (n,) bool, which taxels :class:`.Onsets` finds: contacts of these alone are provisional.
             clipped: (n,) bool, which values are at the end of their range.
             uncertainty: (n,) how much of each value could be noise or drift.
+            sigmas: (n,) by how many standard deviations of its noise each is above its baseline; NaN: not known. No
+                slip is found without them.
 
         Raises:
             ConfigurationError: not of n taxels.
@@ -287,8 +297,22 @@ class Contacts:
         row = np.full(count, NO_CONTACT)
         row[order] = np.arange(len(order))
         contact_of[taxels] = row[contact]
+        found["slips"] = np.zeros(count, bool)
+        if sigmas is not None:
+            found["slips"][order] = self._slipping(
+                found["id"][order], found["frame"][order], contact_of, sigmas, time_ns
+            )
         columns = {name: found[name][order].astype(dtype) for name, (dtype, *_) in COLUMNS.items()}
         return ContactSet(contact_of=contact_of, beyond=beyond, frames=self.frames, **columns)
+
+    def _slipping(
+        self, identity: Whole, frame: Whole, contact_of: npt.NDArray[np.int16], sigmas: npt.NDArray[Any], time_ns: int
+    ) -> Flags:
+        """(m,) which of the m contacts that have rows slip."""
+        taxels = np.flatnonzero(contact_of >= 0)
+        contact = contact_of[taxels].astype(np.int64)
+        counts = (frame[contact] == self._frame[taxels]) & (frame[contact] >= 0) & np.isfinite(sigmas[taxels])
+        return self._slips.update(identity, taxels[counts], contact[counts], sigmas, time_ns)
 
     def _measure(self, taxels: Whole, contact: Whole, load: Doubles, count: int) -> dict[str, npt.NDArray[Any]]:
         order = np.argsort(contact, kind="stable")

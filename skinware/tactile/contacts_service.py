@@ -81,7 +81,7 @@ class ContactsReader(SourceReader[ContactsSample]):
     frame_class = ContactsSample
 
     def events(self, *, timeout_s: float | None = None) -> Iterator[ContactEvent]:
-        """Iterate over onsets, confirmations, withdrawals and ends of contacts, as they come.
+        """Iterate over the events of contacts, as they come.
 
         Times out, and raises, as :meth:`skinware.service.ServiceReader.in_order`.
         """
@@ -125,6 +125,7 @@ class More(TypedDict, total=False):
     onset: Flags | None
     clipped: Flags | None
     uncertainty: npt.NDArray[Any] | None
+    sigmas: npt.NDArray[Any] | None
 
 
 class ContactsWriter(SourceWriter):

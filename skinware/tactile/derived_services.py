@@ -127,7 +127,7 @@ class Loads:
         return touched
 
     def more(self, usable: Flags, unit: str) -> More:
-        """Return onsets, clipped taxels and (in the same unit) uncertainties, as far as they are known."""
+        """Return onsets, clipped taxels, (in the same unit) uncertainties and loads over noise, as far as known."""
         calms = [(stage.given, stage.calm) for stage in self._stages if stage.calm is not None]
         if not calms:
             return {}
@@ -135,10 +135,12 @@ class Loads:
         doubt = _length([np.hypot(calm.noise, calm.uncertainty) for _, calm in calms]) / np.sqrt(np.float32(len(calms)))
         known = np.logical_and.reduce([usable, *(calm.usable for _, calm in calms)])
         clipped = np.logical_or.reduce([given >= self._before.type.maximum for given, _ in calms])
+        given, calm = calms[-1]  # of a vector, the axis along the normal: shear moves its length before it slips
         return {
             "onset": self._onsets.update(deviation, doubt, known),
             "clipped": clipped,
             "uncertainty": doubt if unit == self._before.type.unit else None,
+            "sigmas": (given - calm.baseline) / np.where(known & (calm.noise > 0), calm.noise, np.float32(np.nan)),
         }
 
 

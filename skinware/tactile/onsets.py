@@ -55,6 +55,8 @@ class EventKind(enum.IntEnum):
     """It was none: it went before it was confirmed."""
     ENDED = 3
     """It is over."""
+    SLIPPED = 4
+    """It has begun to slip."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +83,8 @@ class Events:
                 found.append(ContactEvent(EventKind.ONSET, contact, acquired_ns))
             elif not contact.provisional and (before is None or before[0].provisional):
                 found.append(ContactEvent(EventKind.CONFIRMED, contact, acquired_ns))
+            if contact.slips and not (before and before[0].slips):
+                found.append(ContactEvent(EventKind.SLIPPED, contact, acquired_ns))
             self._seen[contact.id] = contact, acquired_ns
         for identity, (contact, seen_ns) in list(self._seen.items()):
             if acquired_ns - seen_ns > _GONE_S * NS_PER_S:

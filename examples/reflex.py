@@ -30,12 +30,12 @@ def main() -> None:
         joints = stack.enter_context(ServiceReader(sys.argv[2], timeout_s=10)) if len(sys.argv) > 2 else None
         begun = set()
         for event in contacts.events():
+            age_us = (now_ns() - event.acquired_ns) / 1000
             if event.kind in (EventKind.ONSET, EventKind.CONFIRMED) and event.contact.id not in begun:
                 begun.add(event.contact.id)
                 act(joints)
             elif event.kind in (EventKind.WITHDRAWN, EventKind.ENDED):
                 begun.discard(event.contact.id)
-            age_us = (now_ns() - event.acquired_ns) / 1000
             print(event.kind.name.lower(), event.contact.id, f"{age_us:.0f} us", flush=True)
 
 

@@ -1,4 +1,4 @@
-"""A reflex on a simulated gripper: from contact in physics to the command that stops it, and what it still presses.
+"""A reflex on a simulated gripper: from contact in physics to the command that stops it, stage by stage.
 
 skin-emulate with the scene `gripper` on a pseudo terminal, skin-driver, skin-calm and examples/reflex.py are a process
 each, with real-time priorities where root starts them. The fingers close at random speeds; both moments are times of
@@ -39,8 +39,13 @@ module = [
 """
 
 
-def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float], list[float], int]:
-    """Close the gripper again and again; return the latencies, ms, the forces 0.5 s later, N, and the misses."""
+def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float], list[float], list[float], int]:
+    """Close the gripper again and again.
+
+    Returns:
+        From contact to command, and from the frame of the first event to that event, ms; the forces 0.5 s later, N; and
+        the number of misses.
+    """
     scenes = ROOT / "skinware_drivers" / "virtual" / "physics" / "scenes"
     binding, port = folder / "gripper.toml", folder / "port"
     binding.write_text(BINDING.format(scenes=scenes, grid="rows = 7, columns = 4, pitch_m = [0.005, 0.005]"))
@@ -51,7 +56,7 @@ def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float],
         ("skin-calm", "robotiq_tsf", "--into", calm),
         (sys.executable, str(ROOT / "examples" / "reflex.py"), calm, "joints"),
     ]
-    random, late_ms, pressed_n, missed = np.random.default_rng(seed), [], [], 0
+    random, late_ms, age_ms, pressed_n, missed = np.random.default_rng(seed), [], [], [], 0
     with ExitStack() as stack:
         for number, command in enumerate(commands):
             output = stack.enter_context((folder / f"log{number}").open("w"))
@@ -67,6 +72,7 @@ def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float],
         for _ in range(closings):
             joints.call("move", targets={"close": 0.0}, seconds=0.3)
             time.sleep(1.5)
+            seen = len((folder / "log3").read_text().splitlines())
             asked_s = float(joints.request().column("commanded_s")[0])
             joints.call("move", targets={"close": 0.025}, seconds=float(random.uniform(0.8, 2.5)))
             asked_s, touched_s = max(asked_s, float(joints.request().column("commanded_s")[0])), np.nan
@@ -74,13 +80,16 @@ def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float],
             while time.monotonic() < until and np.isnan(touched_s):
                 touched_s = float(truth.read(timeout_s=5).column("touched_s")[0])
             time.sleep(0.5)
+            begun = [line.split() for line in (folder / "log3").read_text().splitlines()[seen:]]
+            ages = [float(age) / 1e3 for kind, _, age, _ in begun if kind in ("onset", "confirmed")]
             commanded_s = float(joints.request().column("commanded_s")[0])
-            if commanded_s > asked_s:
+            if commanded_s > asked_s and ages:
+                age_ms.append(ages[0])
                 late_ms.append(1e3 * (commanded_s - touched_s))
                 pressed_n.append(float(truth.request().column("force_n")[0]))
             else:
                 missed += 1
-    return late_ms, pressed_n, missed
+    return late_ms, age_ms, pressed_n, missed
 
 
 def main() -> None:
@@ -93,14 +102,22 @@ def main() -> None:
     os.environ["SKINWARE_NAMESPACE"] = source.name
     try:
         with tempfile.TemporaryDirectory() as folder:
-            late_ms, pressed_n, missed = run(arguments.closings, arguments.seed, Path(folder), calm.name)
+            late_ms, age_ms, pressed_n, missed = run(arguments.closings, arguments.seed, Path(folder), calm.name)
     finally:
         for namespace in (source, calm):
             shutil.rmtree(namespace.path, ignore_errors=True)
     if late_ms:
-        p50, p99, most = np.percentile(late_ms, [50, 99, 100])
-        text = f"p50 {p50:.0f}, p99 {p99:.0f}, most {most:.0f} ms; it then presses {np.median(pressed_n):.2f} N"
-        print(f"contact to command at {PERIOD_MS} ms a frame: {text}")
+        rest_ms = np.subtract(late_ms, age_ms)
+        print(
+            f"{PERIOD_MS} ms a frame, load {os.getloadavg()[0]:.1f}, ms:\n\n| | p50 | p99 | most |\n|---|---|---|---|"
+        )
+        for name, stage in (
+            ("contact to command", late_ms),
+            ("from the frame to its event", age_ms),
+            ("the others: contact to frame, event to command", rest_ms),
+        ):
+            print(f"| {name} | {' | '.join(f'{one:.1f}' for one in np.percentile(stage, [50, 99, 100]))} |")
+        print(f"\nit then presses {np.median(pressed_n):.2f} N")
     print(f"{len(late_ms)} closings stopped, {missed} not")
 
 

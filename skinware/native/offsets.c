@@ -160,6 +160,7 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
     const float slowly = (float)slowly_, of_noise = (float)(slowly_ / (2 - slowly_));
     const float floor = (float)fmin(passed_s / b->tau_s, 0.5), quick = (float)fmin(passed_s / RESETTLE_S, 0.5);
     const float passed = (float)passed_s, other_side = b->is_signed ? -1.0f : 1.0f;
+    const float beside_s = (float)fmax(b->settle_s, 1e-6);
     int64_t number, i;
     for (number = 0; passed_s > 0 && number < b->n_runs; number++) {
         const struct run *run = &b->runs[number];
@@ -173,6 +174,11 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
         INDEPENDENT
         for (i = first; i < last; i++)
             a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1) & (a.bears[i] ^ 1);
+        INDEPENDENT
+        for (i = first; i < last; i++) { /* beside a touch, a rise may be a part of its load */
+            const float rise = highest(a.smooth[i], a.smooth[i] * other_side);
+            a.flag[i] &= (a.settling_s[i] < beside_s) | (rise < rustle_share * a.off[i]);
+        }
         INDEPENDENT
         for (i = first; i < last; i++) {
             const int is_measured = a.flag[i], is_calm = is_measured & (fabsf(a.smooth[i]) < rustle_share * a.off[i]);

@@ -27,6 +27,7 @@ class Surroundings:
         n_modules: number of modules.
         busy: (n,) bool, something touches the patch, or did a moment ago: its cover may sag.
         held: (n,) bool, the taxels that are near a contact, or were in the last ``settle_s``.
+        beside: (n,) bool, those of them that are near one now.
         largest: (n_patches,) the largest load of each patch.
     """
 
@@ -36,6 +37,7 @@ class Surroundings:
         self.largest: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
         self.busy: Flags = np.zeros(len(module), bool)
         self.held: Flags = np.zeros(len(module), bool)
+        self.beside: Flags = np.zeros(len(module), bool)
         self._since_s = np.full(len(self.largest), np.inf)
         self._settling_s: Floats = np.zeros(len(module), np.float32)
 
@@ -55,6 +57,7 @@ class Surroundings:
             self._settling_s[self._near(active)] = max(settle_s, 1e-6)
         self.busy = (self._since_s <= settle_s)[self.patch]
         self.held = self._settling_s > 0
+        self.beside = self._settling_s >= np.float32(max(settle_s, 1e-6))
 
     def _near(self, active: Rows) -> Flags:
         if self._neighbours is None:

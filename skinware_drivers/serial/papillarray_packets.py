@@ -33,7 +33,7 @@ from skinware_drivers.serial.checksums import Sum
 from skinware_drivers.serial.framing import Framed, Framer, ReceivedFraming
 
 _BEGIN, _END = b"\x55\x66\x77\x88", b"\xaa\xbb\xcc\xdd"
-_MOST_BYTES, _MOST_SENSORS, MOST_PILLARS, _LARGEST_POSITION = 4096, 4, 100, 8
+_MOST_BYTES, _MOST_SENSORS, MOST_PILLARS, _LARGEST_POSITION = 4096, 20, 100, 8
 _SUM = Sum(width=16)
 _CONTROLLER, NEWS = 1, 0x400
 STAMP_SIZE = 8

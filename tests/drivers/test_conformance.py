@@ -26,6 +26,7 @@ from skinware_drivers.modbus.revo3 import Revo3Driver
 from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
 from skinware_drivers.serial.anyskin import AnySkinDriver
+from skinware_drivers.serial.dev001 import Dev001Driver
 from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.papillarray import PapillArrayDriver
@@ -53,6 +54,7 @@ from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
 from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.dev001 import EmulatedDev001
 from skinware_drivers.virtual.devices.dex3 import EmulatedDex3
 from skinware_drivers.virtual.devices.dfrobot import EmulatedDfrobot
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
@@ -389,6 +391,14 @@ class TestFlexiTacText(DriverConformance):
 class TestAbilityHand(DriverConformance):
     driver = AbilityHandDriver
     emulator = EmulatedAbilityHand
+
+
+class TestDev001(DriverConformance):
+    driver = Dev001Driver
+    emulator = EmulatedDev001
+
+    def shown(self, felt: Sequence[int]) -> Sequence[Any]:
+        return [float(np.float32(value / 1e3)) for value in felt]
 
 
 class TestPapillArray(DriverConformance):

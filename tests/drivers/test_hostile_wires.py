@@ -85,6 +85,7 @@ CASES = {
     ),
     **dict.fromkeys(("dex3", "robotiq_tsf", "ros2", "weiss_dsa", "weiss_wts", "wuji_glove"), _LINE),
     "papillarray": Case(_pty, {"period_ms": 10}, ("--rate-hz", "100")),
+    "dev001": Case(_pty, driver=("--rate-hz", "100")),
     "dfrobot": Case(_modbus_line),
     "inspire": Case(_modbus_tcp),
     "revo2": Case(_modbus_line),

@@ -38,6 +38,7 @@ ROWS = (
     Row("barrett", "0x569-1", 24, 96, "restarted", "orphans"),  # one of five frames of a puck
     Row("canopen", "0x185", 4, 32, "live", ""),  # one TPDO of a node
     Row("cyskin_cpm", "0x407", 16, 16, "stale", "orphans"),  # one of four frames of a set
+    Row("dev001", "port2", 4, 20, "live", ""),  # the records of a sensor
     Row("dex3", "hand0", 216, 432, "stale", ""),  # the samples of a hand
     Row("dfrobot", "20", 72, 72, "stale", "polls_unanswered"),  # a register of the cells, in both arrays
     Row("flexitac", "data", 384, 384, "stale", ""),  # the frame

@@ -77,7 +77,7 @@ def test_blocks_that_are_not_known_or_missing() -> None:
         changed(0, 9),  # size of a position
         changed(1, 2),  # no block of the Controller
         changed(7, 0xFF),  # a block beyond the end
-        changed(36, 5),  # sensors
+        changed(36, 21),  # sensors
         changed(40, 0xFF),  # pillars
         changed(46, 1),  # type of a pillar
         changed(44, 0x20),  # a pillar before the first

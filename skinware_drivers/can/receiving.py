@@ -1,6 +1,6 @@
-"""Receive all datagrams that have arrived with one system call (``recvmmsg``), and date them on CLOCK_MONOTONIC.
+"""Receive all datagrams of a CAN socket with one system call (``recvmmsg``), dated on CLOCK_MONOTONIC (decision 7).
 
-The time is that of the kernel's stamps or of the controller's clock (decision 7).
+Their controller's rates and state come by rtnetlink; its error frames and the load on its wire from the frames.
 """
 
 from __future__ import annotations
@@ -10,23 +10,203 @@ import fcntl
 import socket
 import struct
 import time
-from typing import Literal
+from collections.abc import Iterator
+from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import FrameBatch
-from skinware_drivers.device_time import DeviceClock
+from skinware.status import BusReason
+from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
+from skinware_drivers.device_time import DeviceClock, Times
 
-Stamps = npt.NDArray[np.int64]
+NO_CAN = "this kernel has no CAN: load it (sudo modprobe can-raw), or use a bus that needs none (--bus virtual)"
+
+# linux/rtnetlink.h, linux/if_link.h, linux/can/netlink.h
+_RTM_NEWLINK, _RTM_GETLINK, _NLM_F_REQUEST = 16, 18, 1
+_IFLA_IFNAME, _IFLA_LINKINFO, _IFLA_INFO_DATA = 3, 18, 2
+_IFLA_CAN_BITTIMING, _IFLA_CAN_STATE, _IFLA_CAN_RESTART_MS, _IFLA_CAN_DATA_BITTIMING = 1, 4, 6, 9
+_HEADER, _INTERFACE = struct.Struct("=IHHII"), struct.Struct("=BxHiII")
+_ANSWER_BYTES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A CAN controller as its kernel driver describes it.
+
+    Attributes:
+        bit_rate: of the arbitration phase, bit/s; 0 if not set.
+        state: 0 error-active, 1 error-warning, 2 error-passive, 3 bus-off, 4 stopped, 5 sleeping; None: unknown.
+        restart_ms: pause before it returns from bus-off by itself; 0: it does not return.
+        data_bit_rate: of the data phase of CAN FD, bit/s; 0 if not set.
+    """
+
+    bit_rate: int = 0
+    state: int | None = None
+    restart_ms: int = 0
+    data_bit_rate: int = 0
+
+
+def read_controller(interface: str) -> Controller | None:
+    """Return the controller of an interface; None if it has none (``vcan``) or cannot be asked."""
+    name = interface.encode() + b"\0"
+    attribute = struct.pack("=HH", 4 + len(name), _IFLA_IFNAME) + name.ljust(-(-len(name) // 4) * 4, b"\0")
+    body = _INTERFACE.pack(socket.AF_UNSPEC, 0, 0, 0, 0) + attribute
+    request = _HEADER.pack(_HEADER.size + len(body), _RTM_GETLINK, _NLM_F_REQUEST, 1, 0) + body
+    try:
+        with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE) as netlink:
+            netlink.settimeout(1.0)  # it answers within the call
+            netlink.send(request)
+            return parse_answer(netlink.recv(_ANSWER_BYTES))
+    except OSError:
+        return None
+
+
+def parse_answer(answer: bytes) -> Controller | None:
+    """Return the controller in an ``RTM_NEWLINK`` message; None if it describes none."""
+    if len(answer) < _HEADER.size + _INTERFACE.size or _HEADER.unpack_from(answer)[1] != _RTM_NEWLINK:
+        return None
+    link = dict(_attributes(answer[_HEADER.size + _INTERFACE.size :]))
+    data = dict(_attributes(dict(_attributes(link.get(_IFLA_LINKINFO, b""))).get(_IFLA_INFO_DATA, b"")))
+    numbers = {kind: struct.unpack_from("=I", value)[0] for kind, value in data.items() if len(value) >= 4}
+    if _IFLA_CAN_STATE not in data and _IFLA_CAN_BITTIMING not in data:
+        return None
+    return Controller(
+        bit_rate=numbers.get(_IFLA_CAN_BITTIMING, 0),
+        state=numbers.get(_IFLA_CAN_STATE),
+        restart_ms=numbers.get(_IFLA_CAN_RESTART_MS, 0),
+        data_bit_rate=numbers.get(_IFLA_CAN_DATA_BITTIMING, 0),
+    )
+
+
+def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:
+    offset = 0
+    while offset + 4 <= len(data):
+        length, kind = struct.unpack_from("=HH", data, offset)
+        if length < 4:
+            return
+        yield kind & 0x3FFF, data[offset + 4 : offset + length]
+        offset += -(-length // 4) * 4
+
+
+# linux/can/error.h: classes, in the identifier
+_CONTROLLER, _PROTOCOL, _TRANSCEIVER, _NO_ACK = 0x4, 0x8, 0x10, 0x20
+_BUS_OFF, _BUS_ERROR, _RESTARTED = 0x40, 0x80, 0x100
+# details of the controller, in byte 1
+_RX_OVERFLOW, _WARNING, _PASSIVE, _ACTIVE = 0x01, 0x04 | 0x08, 0x10 | 0x20, 0x40
+# place in a frame of a protocol error, in byte 3: the two places of the acknowledgement
+_ACK_SLOT, _ACK_DELIMITER = 0x19, 0x1B
+
+CONTROLLER_STATES = (BusReason.NONE, BusReason.ERROR_WARNING, BusReason.ERROR_PASSIVE, BusReason.BUS_OFF)
+"""States 0 to 3 of a controller, in the order of ``enum can_state``."""
+_ACTIVE_CODE, _WARNING_CODE, _PASSIVE_CODE, _BUS_OFF_CODE = 1, 2, 3, 4  # one more than the index of the state
+_TROUBLES = (BusReason.OVERFLOW, BusReason.NO_ACKNOWLEDGEMENT, BusReason.BUS_ERRORS)
+TROUBLE_LASTS_S = 5.0
+"""Time for which a trouble counts that is reported when it happens, but not when it ends."""
+
+
+class ControllerHealth:
+    """The state of one controller, as its error frames add up.
+
+    Error frames come in the stream of data frames, with ``CAN_ERR_FLAG`` in the identifier. With ``berr-reporting`` a
+    bad wire brings thousands a second, so they are read batch by batch.
+
+    Attributes:
+        overflows: how often the controller reported lost frames.
+        bus_offs: how often it left the wire.
+    """
+
+    def __init__(self) -> None:
+        self.overflows: int = 0
+        self.bus_offs: int = 0
+        self._state = BusReason.NONE
+        self._trouble_until_ns = dict.fromkeys(_TROUBLES, 0)
+
+    def take(self, identifier: npt.NDArray[np.uint32], payload: npt.NDArray[np.uint8], time_ns: int) -> None:
+        """Add n error frames, in order of arrival; the time is now, CLOCK_MONOTONIC ns."""
+        detail = np.where(identifier & _CONTROLLER, payload[:, 1], 0)
+        protocol = (identifier & (_PROTOCOL | _BUS_ERROR | _TRANSCEIVER)) != 0
+        at_ack = protocol & np.isin(payload[:, 3], (_ACK_SLOT, _ACK_DELIMITER))
+        overflows = np.count_nonzero(detail & _RX_OVERFLOW)
+        reports = {
+            BusReason.OVERFLOW: overflows,
+            BusReason.NO_ACKNOWLEDGEMENT: np.count_nonzero(at_ack | ((identifier & _NO_ACK) != 0)),
+            BusReason.BUS_ERRORS: np.count_nonzero(protocol & ~at_ack),
+        }
+        for trouble, count in reports.items():
+            if count:
+                self._trouble_until_ns[trouble] = time_ns + round(TROUBLE_LASTS_S * NS_PER_S)
+        code = np.zeros(len(identifier), np.uint8)  # a worse state overwrites a better one
+        code[(detail & _ACTIVE) | (identifier & _RESTARTED) != 0] = _ACTIVE_CODE
+        code[detail & _WARNING != 0] = _WARNING_CODE
+        code[detail & _PASSIVE != 0] = _PASSIVE_CODE
+        code[identifier & _BUS_OFF != 0] = _BUS_OFF_CODE
+        self.overflows += int(overflows)
+        code = code[code != 0]
+        if len(code):
+            was_off = np.append(self._state == BusReason.BUS_OFF, code[:-1] == _BUS_OFF_CODE)
+            self.bus_offs += int(np.count_nonzero((code == _BUS_OFF_CODE) & ~was_off))
+            self._state = CONTROLLER_STATES[int(code[-1]) - 1]
+
+    def heard_data(self) -> None:
+        """Note a data frame after all error frames so far: a controller that receives is not off the wire."""
+        if self._state == BusReason.BUS_OFF:
+            self._state = BusReason.NONE
+
+    def believe(self, state: BusReason) -> None:
+        """Take over the state that the kernel knows: error frames can be lost."""
+        if state == BusReason.BUS_OFF != self._state:
+            self.bus_offs += 1
+        self._state = state
+
+    def reset(self) -> None:
+        """Forget all troubles: the interface is another one, or was set down and up. Counts go on."""
+        self._state = BusReason.NONE
+        self._trouble_until_ns = dict.fromkeys(_TROUBLES, 0)
+
+    def reason(self, time_ns: int) -> BusReason:
+        """Return the worst present trouble; ``NONE`` if there is none."""
+        if self._state != BusReason.NONE:
+            return self._state
+        return next((t for t, until_ns in self._trouble_until_ns.items() if time_ns < until_ns), BusReason.NONE)
+
+
+# ISO 11898-1: bits of a frame without its payload and stuff bits, with the pause behind it
+_CLASSIC_PAYLOAD = 8
+_CLASSIC_BITS, _CLASSIC_EXTENDED_BITS = 47, 67
+_FD_BITS, _FD_EXTENDED_BITS = 30, 49  # at the nominal rate: before the bit rate switch, and from the acknowledgement on
+_FD_SHORT_DATA_BITS, _FD_LONG_DATA_BITS = 32, 37  # at the data rate, with fixed stuff bits: check sum of 17 or 21
+_LONGEST_SHORT_FD = 16
+_STUFFING = 1.1
+# flags of linux/can.h; kernels before 5.14 do not set the last one
+_SWITCHED, _PASSIVE_SENDER, _IS_FD = 0x01, 0x02, 0x04
+
+
+def wire_bits(wire: npt.NDArray[np.void], speed_up: float = 1.0) -> float:
+    """Return about how many bits of the nominal rate frames take; CAN FD frames may switch to a faster one."""
+    if wire.dtype["payload"].shape[0] == _CLASSIC_PAYLOAD:
+        return _classic_bits(wire)
+    length, flags = wire["length"].astype(np.int64), wire["flags"]
+    is_fd = (flags & np.uint8(_SWITCHED | _PASSIVE_SENDER | _IS_FD) != 0) | (length > _CLASSIC_PAYLOAD)
+    fd, length = wire[is_fd], length[is_fd]
+    extended = int(np.count_nonzero(fd["identifier"] & np.uint32(EXTENDED_FLAG)))
+    bits = _FD_BITS * (len(fd) - extended) + _FD_EXTENDED_BITS * extended
+    data = np.where(length > _LONGEST_SHORT_FD, _FD_LONG_DATA_BITS, _FD_SHORT_DATA_BITS) + 8 * length
+    share = np.where(fd["flags"] & np.uint8(_SWITCHED), 1 / speed_up, 1.0)
+    return _classic_bits(wire[~is_fd]) + _STUFFING * (bits + float(data @ share))
+
+
+def _classic_bits(wire: npt.NDArray[np.void]) -> float:
+    extended = int(np.count_nonzero(wire["identifier"] & np.uint32(EXTENDED_FLAG)))
+    bits = _CLASSIC_BITS * (len(wire) - extended) + _CLASSIC_EXTENDED_BITS * extended
+    return _STUFFING * (bits + 8 * int(wire["length"].sum(dtype=np.int64)))
+
 
 LONGEST_DELAY_NS = 100_000_000
 """No frame had its stamp longer before the kernel had the frame."""
 _PART_NS, _JUMP_NS = 250_000_000, 10_000_000  # of the clock of a controller
-
-Stamping = Literal["auto", "hardware", "software"]
 
 # asm-generic/socket.h, linux/net_tstamp.h, linux/ethtool.h
 _SO_TIMESTAMPNS, _SO_TIMESTAMPING = 35, 37
@@ -80,12 +260,12 @@ class Stamper:
             # 20 ns a frame cheaper, and stamps also frames from before the kernel began to stamp (in the background)
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
-    def read(self, control: Stamps) -> Stamps:
+    def read(self, control: Times) -> Times:
         """Return (n,) int64, CLOCK_MONOTONIC ns: when the frames of (n, 8) int64 ancillary data arrived, in order."""
         before_ns = self.offset_ns
         self.offset_ns, poll_ns = _offset_now_ns()
         software = control[:, _SOFTWARE_WORD] * NS_PER_S + control[:, _SOFTWARE_WORD + 1]
-        stamps: Stamps = software + self.offset_ns
+        stamps: Times = software + self.offset_ns
         is_step = abs(self.offset_ns - before_ns) > _SLEW_NS
         if is_step:
             other = software + before_ns
@@ -107,7 +287,7 @@ class Stamper:
             return self.by_controller(control[:, _HARDWARE_WORD] * NS_PER_S + control[:, _HARDWARE_WORD + 1], stamps)
         return stamps
 
-    def by_controller(self, hardware: Stamps, software: Stamps) -> Stamps:
+    def by_controller(self, hardware: Times, software: Times) -> Times:
         """Return (n,) int64, CLOCK_MONOTONIC ns: when frames were on the wire.
 
         Args:

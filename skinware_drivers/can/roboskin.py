@@ -1,8 +1,8 @@
 """ROBOSKIN / iCub skin: MTB3 and MTB4 boards on CAN, sixteen modules of twelve channels each, and inertial sensors.
 
-``roboskin_layout`` has the frames, ``roboskin_setup`` the messages to the boards, ``roboskin_options`` the options, and
-``roboskin_boards`` addresses and firmware. Further sources: robotology/icub-main CanBusSkin.cpp;
-robotology/icub-firmware embot_app_application_theSkin.cpp.
+``roboskin_layout`` has the frames, ``roboskin_setup`` the messages to the boards, their addresses and firmware, and
+``roboskin_options`` the options. Further sources: robotology/icub-main CanBusSkin.cpp; robotology/icub-firmware
+embot_app_application_theSkin.cpp.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from skinware.errors import ConfigurationError, HandshakeTimeout
 from skinware.sensor_types import SensorType
+from skinware.status import Status
 from skinware_drivers import Link, Module, Patch, Watch, operation
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.can.roboskin_boards import BOARD_TYPES, MTB3_TYPE, BoardOperations, discover, read_version
 from skinware_drivers.can.roboskin_layout import (
     HEAD_BYTE,
     INERTIAL,
@@ -45,13 +45,18 @@ from skinware_drivers.can.roboskin_options import (
     usual_kind,
 )
 from skinware_drivers.can.roboskin_setup import (
+    BOARD_TYPES,
+    MTB3_TYPE,
     START,
     STOP,
-    BaselineWatch,
+    BoardOperations,
     BoardSetUp,
+    discover,
+    read_version,
     warn_of_full_bus,
     warn_of_uneven_triangles,
 )
+from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.link import Heard
 
@@ -324,3 +329,40 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 async def _send(link: Link, board: int, messages: Iterable[bytes]) -> None:
     for message in messages:
         await link.send(0x200 | board, message)
+
+
+_RECALIBRATION_CYCLES = 5
+_ZERO, _ALL = 1, (1 << _RECALIBRATION_CYCLES) - 1
+
+
+class BaselineWatch(Watch):
+    """Marks boards that may have moved their baseline.
+
+    A board moves its baseline after five cycles in which a channel did not acknowledge, and the flag of the channel
+    goes away. Until it is set up again, its values are measured from an unknown baseline.
+
+    The count of a board is not always known: a board that was set up again does not say whether it had restarted. So
+    all possible counts are followed, as bits, and a board that may have reached the fifth is marked.
+    """
+
+    def __init__(self, tables: SkinTables) -> None:
+        super().__init__(tables)
+        self._counts: npt.NDArray[np.int64] = np.full(tables.structure.n_patches, _ZERO)  # bit k: it may be at k
+
+    def look(self, updates: Updates) -> None:
+        """Count the cycles without acknowledgement of each board; see :class:`skinware_drivers.polling.Watch`."""
+        status = updates.status[:, 0]  # these flags are those of all sensors of a triangle
+        silent = (status & (Status.NO_ACK | Status.NOT_CONNECTED)) == Status.NO_ACK
+        if not silent.any():
+            return
+        module_patch = self.tables.structure.module_patch
+        cycles = np.bincount(module_patch[updates.module[silent]], minlength=len(self._counts))
+        moved = (self._counts << np.minimum(cycles, _RECALIBRATION_CYCLES)) > _ALL
+        turned = self._counts << cycles % _RECALIBRATION_CYCLES
+        self._counts = (turned | turned >> _RECALIBRATION_CYCLES | moved * _ZERO) & _ALL
+        self.module_status[moved[module_patch]] |= np.uint8(Status.SUSPECT)
+
+    def forget(self, patch: int) -> None:
+        """Trust a board that was set up again: its baseline is known. It goes on counting, unless it had restarted."""
+        super().forget(patch)
+        self._counts[patch] |= _ZERO

@@ -24,8 +24,16 @@ from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, KernelBus, identifier_text
-from skinware_drivers.can.controller import CONTROLLER_STATES, NO_CAN, ControllerHealth, read_controller, wire_bits
-from skinware_drivers.can.receiving import Stamper, Stamping, has_hardware_stamps, rows_of
+from skinware_drivers.can.receiving import (
+    CONTROLLER_STATES,
+    NO_CAN,
+    ControllerHealth,
+    Stamper,
+    has_hardware_stamps,
+    read_controller,
+    rows_of,
+    wire_bits,
+)
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 
@@ -58,7 +66,8 @@ class SocketCanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     buffer: Annotated[int, msgspec.Meta(description="receive buffer, bytes", ge=1)] = WANTED_BUFFER_BYTES
     timestamps: Annotated[
-        Stamping, msgspec.Meta(description="source of time stamps: the controller, the kernel, or the best available")
+        Literal["auto", "hardware", "software"],
+        msgspec.Meta(description="source of time stamps: the controller, the kernel, or the best available"),
     ] = "auto"
     bitrate_switch: Annotated[
         Literal["on", "off"], msgspec.Meta(description="send the payload of CAN FD frames at the data bit rate")

@@ -157,7 +157,7 @@ def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) ->
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """
     from skinware_drivers.cli.driver_setup import DriverArguments, DriverSetup
-    from skinware_drivers.running.flow import FlowLoop
+    from skinware_drivers.running.generation import FlowLoop
 
     cli.log_to_stderr(verbose)
     names = {field.name for field in fields(DriverArguments)}

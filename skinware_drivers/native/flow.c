@@ -1,4 +1,4 @@
-/* Takes, publishes and rests until Python has something to do: running/flow.py. */
+/* Takes, publishes and rests until Python has something to do: running/generation.py. */
 #include "flow.h"
 
 #include <errno.h>

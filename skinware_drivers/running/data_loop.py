@@ -14,8 +14,7 @@ import numpy as np
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.bus import FrameBatch, is_read_natively
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.flow import Flow, FlowLoop
-from skinware_drivers.running.generation import Generation, latency_for, make_batch, split_by_bus
+from skinware_drivers.running.generation import Flow, FlowLoop, Generation, latency_for, make_batch, split_by_bus
 from skinware_drivers.running.guard import Ending
 from skinware_drivers.running.news import MachineLimits, PatchChange
 

@@ -9,7 +9,7 @@
         emulator = EmulatedMyDevice
 
 Everything runs in this process, on an emulated bus, in time that passes only when nothing is left to do
-(:mod:`.clock`): a minute of data takes a moment, and a slow machine changes nothing.
+(:mod:`.waiting`): a minute of data takes a moment, and a slow machine changes nothing.
 
 The emulator is made with ``emulator(options, log=None, source=source)``, as :class:`skinware_drivers.virtual.emulator.
 Emulator` is, and has ``Options``, ``numbers``, ``places()``, ``full_scale`` (and ``lowest``, if that is not 0) and

@@ -19,7 +19,7 @@ from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.running.building import PublishMode
-from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.bus import PtyBus
 from skinware_drivers.streams.tcp import TcpServerBus

@@ -23,8 +23,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.proving.captures import SnapshotLog
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
-from skinware_drivers.testing.clock import run_in_its_time
-from skinware_drivers.testing.waiting import defect, require
+from skinware_drivers.testing.waiting import defect, require, run_in_its_time
 from skinware_drivers.testing.wire import (
     Interference,
     Pattern,

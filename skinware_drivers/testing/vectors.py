@@ -43,8 +43,7 @@ from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import Named, NativePath
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.testing.clock import run_in_its_time
-from skinware_drivers.testing.waiting import defect, require
+from skinware_drivers.testing.waiting import defect, require, run_in_its_time
 from skinware_drivers.testing.wire import make_bus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import EmulatedHardware

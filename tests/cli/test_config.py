@@ -13,7 +13,7 @@ import pytest
 from skinware import Namespace
 from skinware.cli._command import exit_status
 from skinware_drivers import registry
-from skinware_drivers.can import roboskin, roboskin_boards
+from skinware_drivers.can import roboskin, roboskin_setup
 from skinware_drivers.cli.config import command
 from skinware_drivers.finding import running, without_driver
 from skinware_drivers.finding.running import RunningDriver, driver_on, running_drivers, same_bus
@@ -28,7 +28,7 @@ VIRTUAL = "virtual?boards=7,8"
 def hurry(monkeypatch: pytest.MonkeyPatch, namespace: Namespace, tmp_path_factory: pytest.TempPathFactory) -> None:
     see_only(namespace, tmp_path_factory.mktemp("shm"), monkeypatch)
     monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", 0.05)
-    monkeypatch.setattr(roboskin_boards, "_DISCOVERY_S", 0.1)
+    monkeypatch.setattr(roboskin_setup, "_DISCOVERY_S", 0.1)
     monkeypatch.setattr(without_driver, "_LISTEN_S", 0.1)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from skinware import Namespace
 from skinware.cli._command import exit_status
-from skinware_drivers.can import roboskin_boards
+from skinware_drivers.can import roboskin_setup
 from skinware_drivers.cli.find import command
 from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
@@ -50,7 +50,7 @@ def machine(
         monkeypatch.setattr(ports, "serial_ports", lambda: tty or [])
         monkeypatch.setattr(interfaces, "detect_adapters", lambda _timeout_s: found or Detection())
 
-    monkeypatch.setattr(roboskin_boards, "_DISCOVERY_S", 0.1)
+    monkeypatch.setattr(roboskin_setup, "_DISCOVERY_S", 0.1)
     make()
     return make
 

@@ -11,7 +11,7 @@ import pytest
 from skinware.errors import BusNotAvailable, HandshakeTimeout
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
-from skinware_drivers.can import roboskin_boards
+from skinware_drivers.can import roboskin_setup
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
@@ -45,7 +45,7 @@ DISCOVERY = 0x70F
 
 @pytest.fixture(autouse=True)
 def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(roboskin_boards, "_DISCOVERY_S", 0.1)
+    monkeypatch.setattr(roboskin_setup, "_DISCOVERY_S", 0.1)
 
 
 def heard_on(bus: Bus, listen_s: float = 0.15) -> HeardOnBus:

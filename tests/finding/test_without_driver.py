@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from skinware.errors import BusError, BusSendError, ConfigurationError, HandshakeTimeout
-from skinware_drivers.can import roboskin, roboskin_boards
+from skinware_drivers.can import roboskin, roboskin_setup
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.description import Patch
@@ -25,9 +25,9 @@ MTB4 = {"type": "mtb4", "runs": "application", "firmware": "1.25.0", "protocol":
 @pytest.fixture(autouse=True)
 def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", 0.05)
-    monkeypatch.setattr(roboskin_boards, "_DISCOVERY_S", 0.1)
-    monkeypatch.setattr(roboskin_boards, "_BETWEEN_CHECKS_S", 0.01)
-    monkeypatch.setattr(roboskin_boards, "_ADDRESS_CHECKS", 2)
+    monkeypatch.setattr(roboskin_setup, "_DISCOVERY_S", 0.1)
+    monkeypatch.setattr(roboskin_setup, "_BETWEEN_CHECKS_S", 0.01)
+    monkeypatch.setattr(roboskin_setup, "_ADDRESS_CHECKS", 2)
     monkeypatch.setattr(without_driver, "_LISTEN_S", 0.15)
 
 

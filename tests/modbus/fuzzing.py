@@ -31,8 +31,7 @@ from skinware_drivers.modbus.master import Listener, Master
 from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.flow import Flow
-from skinware_drivers.running.generation import Generation
+from skinware_drivers.running.generation import Flow, Generation
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.ports import DescriptorPort, Port
 from skinware_drivers.virtual.hand_clock import HandClock

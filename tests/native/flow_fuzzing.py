@@ -34,8 +34,7 @@ from skinware_drivers.layout import Frame
 from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.flow import Flow
-from skinware_drivers.running.generation import Generation
+from skinware_drivers.running.generation import Flow, Generation
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus

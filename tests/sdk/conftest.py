@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from skinware.realtime import NS_PER_S
-from skinware_drivers.can import roboskin, roboskin_boards
+from skinware_drivers.can import roboskin, roboskin_setup
 from skinware_drivers.running import bus_line
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual import bus
@@ -30,7 +30,7 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits, where a test is not about their length. The order of all things stays."""
     monkeypatch.setattr(roboskin, "_AFTER_CONFIGURATION_S", HURRIED_WAIT_S)
-    monkeypatch.setattr(roboskin_boards, "_DISCOVERY_S", 0.1)
+    monkeypatch.setattr(roboskin_setup, "_DISCOVERY_S", 0.1)
     monkeypatch.setattr(bus_line, "_FIRST_PAUSE_S", 0.03)
     monkeypatch.setattr(bus_line, "_LONGEST_PAUSE_S", 0.12)
 

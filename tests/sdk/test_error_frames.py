@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG
-from skinware_drivers.can.controller import TROUBLE_LASTS_S, Controller, ControllerHealth, parse_answer, read_controller
+from skinware_drivers.can.receiving import TROUBLE_LASTS_S, Controller, ControllerHealth, parse_answer, read_controller
 
 # class, bytes 0 to 7, and what is wrong then; from linux/can/error.h and the drivers sja1000, mcp251xfd, dev/dev.c
 FRAMES = {

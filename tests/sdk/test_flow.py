@@ -20,15 +20,14 @@ from skinware import BusReason, BusState, DriverReader, Status
 from skinware.errors import DriverError
 from skinware.status import DataPath
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can.roboskin import RoboskinDriver
+from skinware_drivers.can.roboskin import BaselineWatch, RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
-from skinware_drivers.can.roboskin_setup import BaselineWatch
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.native.structs import Source
 from skinware_drivers.polling import Watch
-from skinware_drivers.running.flow import FlowLoop, FlowSelector
+from skinware_drivers.running.generation import FlowLoop, FlowSelector
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.driving import Driving, carried_on, driving_lines
 from skinware_drivers.testing.waiting import wait_until

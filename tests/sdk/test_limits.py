@@ -11,7 +11,7 @@ import pytest
 from skinware import DriverReader
 from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, load_report
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
-from skinware_drivers.can.controller import wire_bits
+from skinware_drivers.can.receiving import wire_bits
 from skinware_drivers.running.news import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
 from tests.sdk.clock import Clock
 from tests.sdk.driving import driving, emulated, read_until

@@ -27,8 +27,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
 from skinware_drivers.polling import Poll, check_polls
 from skinware_drivers.running.poller import Poller
-from skinware_drivers.testing.clock import run_in_its_time
-from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.testing.waiting import run_in_its_time, wait_until
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame
 from tests.sdk.driving import TroubledBus, driving_lines, read_until

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, PatchState, Status
-from skinware_drivers.can import roboskin, roboskin_boards
+from skinware_drivers.can import roboskin, roboskin_setup
 from skinware_drivers.can.roboskin_options import Kind
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -145,7 +145,7 @@ def test_named_boards_of_which_none_answers_are_waited_for(caplog: pytest.LogCap
 def test_a_bus_without_boards_holds_no_other_up_and_joins_later(
     monkeypatch: pytest.MonkeyPatch, boards: tuple[int, ...]
 ) -> None:
-    monkeypatch.setattr(roboskin_boards, "_REPLY_S", 0.05)
+    monkeypatch.setattr(roboskin_setup, "_REPLY_S", 0.05)
     late = LateBoards(EmulatedRoboskin(EmulatorOptions(boards=(7,), pattern="idle")))
     log: list[Event] = []
     buses = emulated(log, boards=(7,), pattern="idle"), VirtualCanBus("", hardware=late)

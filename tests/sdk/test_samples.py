@@ -19,7 +19,7 @@ from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import Packet
-from skinware_drivers.testing.clock import run_in_its_time
+from skinware_drivers.testing.waiting import run_in_its_time
 from skinware_drivers.virtual.bus import VirtualSerialBus
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.hardware import WireFrame

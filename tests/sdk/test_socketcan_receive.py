@@ -18,7 +18,7 @@ from skinware import BusReason
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can import receiving, socketcan
-from skinware_drivers.can.controller import CONTROLLER_STATES, Controller
+from skinware_drivers.can.receiving import CONTROLLER_STATES, Controller
 from skinware_drivers.can.socketcan import SocketCanBus
 from tests.sdk.cable import SO_RCVBUFFORCE, Cable, ChoosySocket, drain
 

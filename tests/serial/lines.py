@@ -21,7 +21,7 @@ from skinware_drivers.fields import Identifier, Match
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus

@@ -20,7 +20,7 @@ from skinware.status import BusReason, BusState, Status
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import OWN_BUS_COUNTERS
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import LengthTable, Packet

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from skinware_drivers.adapter import AnyAdapter
-from skinware_drivers.testing import clock
+from skinware_drivers.testing import waiting
 from skinware_drivers.testing.conformance import DriverConformance
 from skinware_drivers.testing.waiting import wait_until
 from tests.testing import fingertips as f
@@ -162,7 +162,7 @@ def test_it_is_found_and_named(driver: type[AnyAdapter], test: str, arguments: t
 @pytest.mark.thorough
 @pytest.mark.usefixtures("tidy", "namespace")
 def test_a_driver_that_computes_without_end_is_found_by_its_processor_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock, "_LONGEST_TURN_S", 0.5)
+    monkeypatch.setattr(waiting, "_LONGEST_TURN_S", 0.5)
     suite = TestFingertips()
     suite.driver = f.Computes  # type: ignore[misc]
     with pytest.raises(pytest.fail.Exception, match=r"loops without end, here:(?s:.*)fingertips.py(?s:.*)enough"):

@@ -28,7 +28,7 @@ from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
-from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 
 QUIET_S = 2.5

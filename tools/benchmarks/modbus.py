@@ -44,7 +44,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers import Module, NoOptions, Patch, taxels
 from skinware_drivers.modbus import ModbusAdapter, Registers, wire
 from skinware_drivers.registry import make_bus
-from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 
 PARTS = ("tcp", "rtu")

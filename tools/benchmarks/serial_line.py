@@ -39,7 +39,7 @@ from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.fields import Bits
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus

@@ -28,7 +28,7 @@ from serial_line import NAME, PACED_B_S, Skin, frames_of
 
 from skinware import Namespace
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running.flow import FlowLoop
+from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.bus import SerialBus
 

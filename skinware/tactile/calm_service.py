@@ -147,7 +147,7 @@ class CalmService:
         self.motion = CalmMotion(moving[0], name, self.into, group, moving[1], self.contacts)
         self.health = CalmHealth(health, name, self.into, group)
         self._settings = settings or ChainSettings.calm()
-        self._learned = LearnedState(state_path, self.health)
+        self._learned = LearnedState(state_path)
         self._requests = CalmRequests(name)
         self._source = DriverSource(name, self.namespace)
         self._calmed = CalmedDriver(name, self.into, group, self._requests.operations)
@@ -222,7 +222,7 @@ class CalmService:
         """Go on with another structure of the driver."""
         assert self._source.reader is not None  # noqa: S101 - it read the frame
         before, chain = self.chain, self._settings.chain(frame.structure)
-        learned = None if before is None else self._learned.state(before)
+        learned = None if before is None else before.state()
         rate_hz = NS_PER_S / frame.period_ns if frame.period_ns else None
         self._calmed.follow(chain.structure, self._source.reader, rate_hz)
         for derived in (self.contacts, self.motion, self.health):

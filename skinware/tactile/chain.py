@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import msgspec
 import numpy as np
@@ -217,11 +217,12 @@ class ChainState:
     fingerprint: str
     arrays: Arrays
 
-    def of(self, chain: Chain, type_name: str, kind: str = "") -> tuple[Arrays, npt.NDArray[np.intp]]:
-        """Return the arrays of a type, none if it has none, and (n,) the row in them of each taxel; -1: nowhere."""
-        found = part_of(self.arrays, f"{kind}{type_name}/")
-        row_of = {one: row for row, one in enumerate(found["uid"].tolist())} if found else {}
-        return found, np.array([row_of.get(one, -1) for one in chain.uid(type_name).tolist()], np.intp)
+
+class Learning(Protocol):
+    """What learns of n taxels: baselines, stages, health."""
+
+    def state(self) -> Arrays: ...
+    def restore(self, state: Arrays, rows: npt.NDArray[np.intp]) -> int | None: ...
 
 
 class Chain:
@@ -247,44 +248,47 @@ class Chain:
                     self.baseline_stages.setdefault(name, stage)
                 elif isinstance(stage, CurveStage):
                     self.curve_stages[name] = stage
+        self._learning: list[tuple[str, Learning, str, str]] = []
+        for name, baseline in self.baselines.items():
+            self.keep(name, baseline, f"{name}/")
+            for stage in self.stages[name]:
+                if stage.taxels.type.name == name:  # others only read it
+                    self.keep(name, stage, f"{name}/", f"{stage.name}.")
         self.vectors = [names for stage, names in steps if isinstance(stage, VectorStage)]
         self._before = structure
         self._suspect: dict[str, Flags] = {}
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
         self.structure: Structure = structure.replace(types=types, dtype=np.float32)
 
+    def keep(self, type_name: str, learning: Learning, group: str, name: str = "") -> None:
+        """Let the state have what is learned of a type: arrays whose names begin with ``group`` and ``name``."""
+        self._learning.append((type_name, learning, group, name))
+
     def state(self) -> ChainState:
-        """Return what its baselines have learned."""
+        """Return all that was learned."""
         found: Arrays = {}
-        for name, baseline in self.baselines.items():
-            arrays = {"uid": self.uid(name), **baseline.state()}
-            for stage in self._own_stages(name):
-                arrays |= {f"{stage.name}.{key}": array for key, array in stage.state().items()}
-            found |= {f"{name}/{key}": array for key, array in arrays.items()}
+        for type_name, learning, group, name in self._learning:
+            found[f"{group}uid"] = self.uid(type_name)
+            found |= {f"{group}{name}{key}": array for key, array in learning.state().items()}
         return ChainState(self._fingerprint, found)
 
-    def _own_stages(self, name: str) -> list[Stage]:
-        """Stages of a type, without those that only read it."""
-        return [stage for stage in self.stages[name] if stage.taxels.type.name == name]
-
     def restore(self, state: ChainState) -> int:
-        """Go on with what the baselines of another chain had learned, taxel by taxel, if they saw the same values.
+        """Go on with what another chain had learned, taxel by taxel, if its baselines saw the same values.
 
         Returns:
-            The number of those taxels; 0 if there were other stages before the baselines, or other units.
+            The number of taxels that have their baselines again; 0 if there were other stages before them, or other
+            units.
 
         Raises:
             ConfigurationError: that is no such state.
         """
-        if not self.fits(state):
-            return 0
         restored = 0
-        for name, baseline in self.baselines.items():
-            learned, rows = state.of(self, name)
-            if learned:
-                restored += baseline.restore(learned, rows)
-                for stage in self._own_stages(name):
-                    stage.restore(part_of(learned, f"{stage.name}."), rows)
+        for type_name, learning, group, name in self._learning if self.fits(state) else ():
+            known = part_of(state.arrays, group)
+            if known:
+                row_of = {one: row for row, one in enumerate(known["uid"].tolist())}
+                rows = np.array([row_of.get(one, -1) for one in self.uid(type_name).tolist()], np.intp)
+                restored += learning.restore(part_of(known, name), rows) or 0
         return restored
 
     def fits(self, state: ChainState) -> bool:

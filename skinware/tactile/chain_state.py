@@ -1,4 +1,4 @@
-"""Keep what a chain and its health have learned in a file, for the next start."""
+"""Keep what a chain has learned in a file, for the next start."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 import os
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,6 @@ from skinware.realtime import NS_PER_S, now_ns
 from skinware.tactile.arrays import read_arrays, write_arrays
 from skinware.tactile.baseline import FORGET_AFTER_S
 from skinware.tactile.chain import HEALTH, Chain, ChainState
-from skinware.tactile.derived_services import CalmHealth
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
@@ -64,33 +62,23 @@ def default_path(namespace: str, name: str) -> Path:
 
 
 class LearnedState:
-    """Keeps what one chain has learned, and what is known of its health, in a file (None: in none)."""
+    """Keeps what one chain has learned in a file (None: in none)."""
 
-    def __init__(self, path: Path | None, health: CalmHealth) -> None:
-        self._path, self._health = path, health
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
         self._saving: threading.Thread | None = None
         self._next_save_ns = now_ns() + _SAVE_EVERY_NS
 
-    def state(self, chain: Chain) -> ChainState:
-        state, judged = chain.state(), self._health.judged
-        return state if judged is None else replace(state, arrays=state.arrays | judged.state())
-
     def restore(self, chain: Chain, state: ChainState | None = None) -> int:
-        """Let a new chain, which its health follows already, go on with a state, or else with that in the file.
+        """Let a new chain go on with a state, or else with that in the file; return how many baselines that gave.
 
         A state that does not fit is not used, and a line in the log says why.
-
-        Returns:
-            The number of sensors that have their baselines again.
         """
         restored, why = 0, ""
         if state is None and self._path is not None:
             state, why = read_state(self._path)
         try:
-            if state is not None:
-                restored = chain.restore(state)
-                if self._health.judged is not None:
-                    self._health.judged.restore(state)
+            restored = 0 if state is None else chain.restore(state)
         except ConfigurationError as error:
             why = f"{self._path}: {error}"
         if why:
@@ -119,7 +107,7 @@ class LearnedState:
             return
         if not any(baseline.ready.any() for baseline in chain.baselines.values()):
             return  # a file from before says more
-        state = self.state(chain)
+        state = chain.state()
 
         def save() -> None:
             try:

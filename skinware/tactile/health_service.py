@@ -15,8 +15,8 @@ import numpy as np
 
 from skinware.errors import ConfigurationError
 from skinware.structure import Structure
-from skinware.tactile.arrays import Arrays, Flags, rows_of
-from skinware.tactile.chain import HEALTH, BaselineStage, Chain, ChainState
+from skinware.tactile.arrays import Flags, rows_of
+from skinware.tactile.chain import HEALTH, BaselineStage, Chain
 from skinware.tactile.health import COLUMNS, NOTHING, Health, HealthReport
 from skinware.tactile.source_service import (
     ServiceForm,
@@ -117,6 +117,7 @@ class ChainHealth:
                 log.warning("%s of %r: dead and weak sensors are not found: %s", name, driver, error)
                 health = Health(taxels.module, resolution=taxels.resolution, limits=limits)
             self._watched[name] = stage, health
+            chain.keep(name, health, f"{HEALTH}{name}/")
 
     def __bool__(self) -> bool:
         return bool(self._watched)
@@ -130,21 +131,6 @@ class ChainHealth:
     def reports(self) -> dict[str, HealthReport]:
         """Judge the sensors of each type, in the order of ``structure.index``."""
         return {name: health.report() for name, (_, health) in self._watched.items()}
-
-    def state(self) -> Arrays:
-        """Return what is known, for the state of the chain."""
-        found: Arrays = {}
-        for name, (_, health) in self._watched.items():
-            arrays = {"uid": self._chain.uid(name), **health.state()}
-            found |= {f"{HEALTH}{name}/{key}": array for key, array in arrays.items()}
-        return found
-
-    def restore(self, state: ChainState) -> None:
-        """Go on with what was known, if the baselines saw the same values then; raises ConfigurationError."""
-        for name, (_, health) in self._watched.items():
-            known, rows = state.of(self._chain, name, HEALTH)
-            if known and self._chain.fits(state):
-                health.restore(known, rows)
 
     def faulty(self, reports: dict[str, HealthReport]) -> Flags:
         """Return (n_sensors,) bool: the sensors of the driver that have a fault in ``reports``."""

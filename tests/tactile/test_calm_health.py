@@ -110,12 +110,12 @@ def test_what_is_known_is_there_after_a_restart(into: Namespace, tmp_path: Path,
     with calmed(into) as skin, HealthReader(namespace=into) as reader:
         skin.go_on(SETTLED_NS)
         before = reader.read().report
-        LearnedState(path, skin.health).close(skin.chain)
+        LearnedState(path).close(skin.chain)
     with np.load(path) as file:
         arrays = dict(file)
     np.savez(path, allow_pickle=False, **arrays | {"time_s": arrays["time_s"] - age_s})
     with calmed(into) as skin, HealthReader(namespace=into) as reader:
-        assert LearnedState(path, skin.health).restore(skin.chain) == (0 if age_s else 640)
+        assert LearnedState(path).restore(skin.chain) == (0 if age_s else 640)
         skin.go_on(PERIOD_NS)
         report = reader.read().report
         assert report.kind[[AT_END, RUSTLING]].tolist() == [HealthKind.CLIPPED, HealthKind.NOISY]
@@ -131,14 +131,14 @@ def test_health_that_does_not_fit_is_begun_anew(
     path = tmp_path / "fake.npz"
     with calmed(into) as skin:
         skin.go_on(SETTLED_NS)
-        state = LearnedState(path, skin.health).state(skin.chain)
+        state = skin.chain.state()
         if damage == "missing":
             del state.arrays["health/pressure/noise"]
         elif damage == "shape":
             state.arrays["health/pressure/noise"] = np.zeros((640, 2), np.float32)
         save_state(path, replace(state, fingerprint="another") if damage == "of another scale" else state)
     with calmed(into) as skin:
-        LearnedState(path, skin.health).restore(skin.chain)
+        LearnedState(path).restore(skin.chain)
         skin.go_on(PERIOD_NS)
         assert skin.health.faulty == 0
     assert ("the learned state does not fit" in caplog.text) == (damage != "of another scale")

@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from onnx import TensorProto, helper, numpy_helper
 
 import skinware
 import skinware.recording
@@ -50,6 +51,21 @@ def start(name: str, *options: str | Path) -> subprocess.Popen[bytes]:
     with skinware.DriverReader(name, timeout_s=PATIENCE_S) as reader:
         reader.read(timeout_s=PATIENCE_S)
     return process
+
+
+def write_encoder() -> None:
+    """Write ``encoder.onnx``: 16 multiples of the mean of any number of taxels."""
+    values = helper.make_tensor_value_info("values", TensorProto.FLOAT, [1, 8, "taxels"])
+    code = helper.make_tensor_value_info("code", TensorProto.FLOAT, [1, 16])
+    nodes = [
+        helper.make_node("ReduceMean", ["values"], ["mean"], axes=[1, 2], keepdims=1),
+        helper.make_node("MatMul", ["mean", "mixture"], ["mixed"]),
+        helper.make_node("ReduceMean", ["mixed"], ["code"], axes=[1], keepdims=0),
+    ]
+    mixture = numpy_helper.from_array(np.random.default_rng(0).normal(size=(1, 16)).astype(np.float32), "mixture")
+    graph = helper.make_graph(nodes, "encoder", [values], [code], [mixture])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    Path("encoder.onnx").write_bytes(model.SerializeToString())
 
 
 def start_torso(page: str) -> Callable[[Structure], None]:

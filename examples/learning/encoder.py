@@ -1,7 +1,7 @@
 """Teach an encoder touch without labels, and run it beside a driver.
 
-Half of the taxels are hidden, and a small network learns to say from the others what they feel. What it passes on for
-that, a code of 16 numbers, is a shorter way to say the touch. A processor does it in a minute::
+Half of the taxels are hidden, and a small network learns to say from the others what they feel. On the way it makes a
+code of 16 numbers, which says the touch shortly::
 
     python encoder.py train encoder.onnx grips/grips.mcap    # any recordings of one skin; needs torch, onnx, onnxscript
     python encoder.py serve encoder.onnx finger              # publishes the service "code"; needs onnxruntime

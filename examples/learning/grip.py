@@ -149,7 +149,7 @@ def train(folder: Path) -> None:
     curves: dict[str, list[list[float]]] = {}
     for name, columns in (
         ("without", ["closing"]),
-        ("with touch", ["closing", "touch.finger.sum", "touch.finger.peak"]),
+        ("with touch", ["closing", "touch.finger.sum.vel", "touch.finger.peak.vel"]),
     ):
         inputs = states[:, [names.index(column) for column in columns]]
         curves[name] = [_curve(torch, inputs, actions, seed) for seed in range(SEEDS)]

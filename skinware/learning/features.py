@@ -19,6 +19,15 @@ Positions = npt.NDArray[np.int64]
 Each = Literal["module", "taxel", "point"]
 
 
+def state_name(number: str) -> str:
+    """Return the name of a number of touch in the state of a robot: ``touch.NUMBER.vel``.
+
+    LeRobot's rollout gives a policy only numbers whose names end in ``.pos`` or ``.vel``, and moves the robot back to
+    those in ``.pos`` (huggingface/lerobot v0.6.1, lerobot/rollout/context.py).
+    """
+    return f"touch.{number}.vel"
+
+
 class Totals:
     """Named numbers of some sensors: of each module the sum and the largest value, every sensor, or a point set.
 

@@ -732,10 +732,10 @@ def test_touch_as_state_is_beside_the_joints(made: Made, tmp_path: Path) -> None
     module = "touch.board_7.triangle_0"
     assert names == [
         "hip",
-        f"{module}.sum",
-        f"{module}.peak",
+        f"{module}.sum.vel",
+        f"{module}.peak.vel",
         *(n.replace("_0", "_1") for n in names[1:3]),
-        "touch.age_s",
+        "touch.age_s.vel",
     ]
     assert not any(name.startswith(TACTILE) for name in read.features)
     assert state[:, 1] == pytest.approx(values[:, :10].sum(axis=1), rel=1e-5)

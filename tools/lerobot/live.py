@@ -1,7 +1,7 @@
 """Records an emulated hand with lerobot-record, and compares every row with the recorded frame nearest to its time.
 
 The time of a row is that of the robot, which logs when it was asked. Where the process was held up between the plugin's
-look at the clock and the robot's, the row's own touch.age_s says the plugin's.
+look at the clock and the robot's, the row's own age says the plugin's.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import skinware
 import skinware.recording
-from skinware.learning.features import Totals
+from skinware.learning.features import Totals, state_name
 from skinware.learning.images import Colours, TouchImage, range_of
 
 BIN = Path(sys.executable).parent
@@ -110,7 +110,7 @@ def check_rows(folder: Path, name: str, busy: int) -> None:
         layout = next(iter(recording.snapshots())).layout
     positions = np.arange(len(layout.module_of("pressure")))
     totals = Totals(layout, "pressure", positions, "taxel")
-    columns = [names.index(f"touch.{each}") for each in totals.names]
+    columns = [names.index(state_name(each)) for each in totals.names]
     values = np.where(series.status_of("pressure") == 0, series.physical("pressure"), 0)
     times_ns = np.loadtxt(f"{folder / name}.times", np.int64)
     assert len(times_ns) == len(state) == dataset.meta.total_frames, (len(times_ns), len(state))
@@ -118,7 +118,7 @@ def check_rows(folder: Path, name: str, busy: int) -> None:
     period_ns = series.origin.period_ns
     image = TouchImage(layout, "pressure", positions, 48, 96, Colours("grey", *range_of(layout, "pressure")))
     of_all, late, held_up, offs = 0, 0, 0, []
-    age_ns = np.rint(state[:, names.index("touch.age_s")].astype(np.float64) * 1e9).astype(np.int64)
+    age_ns = np.rint(state[:, names.index(state_name("age_s"))].astype(np.float64) * 1e9).astype(np.int64)
     for row, time_ns in enumerate(times_ns.tolist()):
         equal = np.flatnonzero((values.astype(np.float32) == state[row, columns]).all(axis=1))
         before_ns = time_ns - (acquired_ns[equal] + age_ns[row])
@@ -208,7 +208,7 @@ def check_death(folder: Path) -> None:
         end(hand)
         assert recorder.returncode == 0, errors[-3000:]
         dataset = LeRobotDataset(f"skinware/{name}", root=folder / name)
-        held = dataset.meta.features["observation.state"]["names"].index("touch.held")
+        held = dataset.meta.features["observation.state"]["names"].index(state_name("held"))
         flags = np.array([float(each[held]) for each in dataset.hf_dataset["observation.state"]])
         assert 0 < flags.sum() < len(flags)
         assert flags[0] == flags[-1] == 0

@@ -24,7 +24,7 @@ class SkinwareConfig(TouchOptions, RobotConfig):
         numbers: ``module``: the sum and the largest value of each module; ``taxel``: each value; ``point``: place and
             force of each taxel, six numbers, in the order of LeRobot's proposed point sets; ``none``.
         contacts: number of contacts, the largest first, each with load and place; from the service ``contacts``.
-        when_stale: with ``hold``, ``touch.held`` says when the last touch is held.
+        when_stale: with ``hold``, ``touch.held.vel`` says when the last touch is held.
     """
 
     robot: dict[str, Any] = field(default_factory=dict)

@@ -12,17 +12,18 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from lerobot_robot_skinware.configuration import SkinwareConfig
 from skinware.errors import ServiceNotFound, ServiceTimeout
-from skinware.learning.features import CONTACT_NUMBERS, Totals, contact_numbers
+from skinware.learning.features import CONTACT_NUMBERS, Totals, contact_numbers, state_name
 from skinware.learning.live import TouchSample
 from skinware.realtime import now_ns
 
-HELD, AGE = "touch.held", "touch.age_s"
+HELD, AGE = state_name("held"), state_name("age_s")
 
 
 class Skinware(Robot):
     """A robot with touch in its state. All else is that robot.
 
-    Its state has the numbers of touch, ``touch.age_s`` and, with ``when_stale: hold``, ``touch.held``.
+    Its state has the numbers of touch, their age and, with ``when_stale: hold``, a flag; for their names see
+    :func:`skinware.learning.features.state_name`.
 
     Attributes:
         robot: the robot that moves.
@@ -71,8 +72,9 @@ class Skinware(Robot):
     @property
     def observation_features(self) -> dict[str, Any]:
         """The robot's features, then those of touch, then images of the further cameras."""
-        names = [f"touch.{name}" for name in self._numbers.names]
-        names += [f"touch.contact_{row}.{name}" for row in range(self.config.contacts) for name in CONTACT_NUMBERS]
+        names = [state_name(name) for name in self._numbers.names]
+        rows = range(self.config.contacts)
+        names += [state_name(f"contact_{row}.{name}") for row in rows for name in CONTACT_NUMBERS]
         names += [AGE, *([HELD] if self.config.when_stale == "hold" else [])]
         images = {name: (each.height, each.width, 3) for name, each in self._own_cameras.items()}
         return {**self.robot.observation_features, **dict.fromkeys(names, float), **images}
@@ -131,7 +133,7 @@ class Skinware(Robot):
         numbers = dict(zip(self._numbers.names, self._numbers.of(values).tolist(), strict=True))
         for row, contact in enumerate(contact_numbers(touch.contacts, self.config.contacts).tolist()):
             numbers |= {f"contact_{row}.{name}": x for name, x in zip(CONTACT_NUMBERS, contact, strict=True)}
-        named = {f"touch.{name}": value for name, value in numbers.items()}
+        named = {state_name(name): value for name, value in numbers.items()}
         age_s = (time_ns - int(np.min(touch.snapshot.acquired_ns))) / 1e9
         return {**named, AGE: age_s, **({HELD: float(touch.is_held)} if self.config.when_stale == "hold" else {})}
 

@@ -13,12 +13,12 @@ from skinware.conversion.learning.features import IMAGE, Batch, Feature
 from skinware.conversion.learning.wanted import LearningSet
 from skinware.conversion.tables import package
 from skinware.errors import ConfigurationError
-from skinware.learning.features import Totals, points
+from skinware.learning.features import Totals, points, state_name
 from skinware.learning.images import Colours, TouchImage, range_of
 from skinware.skin_layout import SkinLayout
 from skinware.structure import Structure
 
-STATE, AGE = "observation.state", "touch.age_s"
+STATE, AGE = "observation.state", state_name("age_s")
 _TACTILE = "observation.tactile."
 INTERPOLATED = _TACTILE + "interpolated"
 
@@ -92,7 +92,7 @@ class SetForm:
     def _state_names(self) -> Sequence[str]:
         each = [(name, number) for name, totals in self._totals.items() for number in totals.names]
         return [
-            *(f"touch.{number}" if len(self._types) == 1 else f"touch.{name}.{number}" for name, number in each),
+            *(state_name(number if len(self._types) == 1 else f"{name}.{number}") for name, number in each),
             AGE,
         ]
 

@@ -193,7 +193,6 @@ class Gathering:
             raise
 
     def _show_coverage(self) -> None:
-        """Show the coverage of each patch, and a picture of the skin."""
         structure, type_name, coverage = self.structure, self.type_name, self._session.coverage
         for line in bars(structure, type_name, coverage):
             echo(line)

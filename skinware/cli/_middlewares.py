@@ -341,7 +341,6 @@ def foxglove(
 
 
 def _run(sink: Sink, names: tuple[str, ...], rate_hz: float, namespace: str | None, as_json: bool, where: str) -> None:
-    """Show drivers until a signal ends it."""
     from skinware.conversion.live import stream
     from skinware.memory.namespace import Namespace, check_name
 

@@ -181,8 +181,6 @@ def _target(path: Path, split_size: int | None, max_size: int | None, last_s: fl
 
 
 class _Progress:
-    """Report a recording while it runs and at its end."""
-
     def __init__(self, recorder: Recorder, target: Target, path: Path, as_json: bool) -> None:
         self._recorder, self._target, self._path, self._as_json = recorder, target, path, as_json
         self._begin_s = time.monotonic()

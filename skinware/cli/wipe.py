@@ -63,8 +63,6 @@ def command(
 
 
 class _Wipe:
-    """Run a wipe test and report it."""
-
     def __init__(self, reader: DriverReader, type_name: str | None, as_json: bool) -> None:
         import numpy as np
 

@@ -92,8 +92,6 @@ class _CodedStream:
 
 
 class _RecordingWriter:
-    """Codes frames and fills chunks."""
-
     def __init__(self, file: RecordingFile) -> None:
         self._file = file
         self._channels = Channels()

@@ -76,9 +76,8 @@ class Capture:
         self._process.stdin.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(_END_S)
-        if self._process.poll() is None:
-            self._process.kill()
-            self._process.wait()
+        self._process.kill()  # of no effect where it has ended
+        self._process.wait()
         self.result |= self._next()
         if self._process.stdout is not None:
             self._process.stdout.close()

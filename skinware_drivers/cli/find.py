@@ -191,17 +191,14 @@ async def _ask(
     from skinware_drivers.finding.looking import ProbeAnswer, ask, ask_port
     from skinware_drivers.finding.running import driver_on
 
-    answers = {}
+    answers, of = {}, {medium: known_drivers(medium, driver_names) for medium in ("can", "serial", "modbus")}
     for name, one in heard.items():
-        owner = driver_on(name, running)
-        answers[name] = await ask(
-            one, known_drivers("can", driver_names), force=force, owner="" if owner is None else str(owner)
-        )
+        answers[name] = await ask(one, of["can"], force=force, owner=str(driver_on(name, running) or ""))
     for name in networks:
         owner = driver_on(name, running)
         refused = ProbeAnswer(name, refused=f"{owner} has it")
         medium = "modbus" if parse_bus_name(name).interface == "modbus" else "serial"
-        answers[name] = refused if owner else await ask_port(name, known_drivers(medium, driver_names))
+        answers[name] = refused if owner else await ask_port(name, of[medium])
     for port in ports:
         owner = driver_on(port.path, running)
         users = [f"{user.program} (pid {user.pid})" for user in port.users]
@@ -210,8 +207,7 @@ async def _ask(
         elif not port.may_open:
             answers[port.path] = ProbeAnswer(port.path, refused="you may not open it")
         else:
-            of_ports = known_drivers("serial", driver_names) | known_drivers("modbus", driver_names)
-            answers[port.path] = await ask_port(port.path, of_ports)
+            answers[port.path] = await ask_port(port.path, of["serial"] | of["modbus"])
     return answers
 
 

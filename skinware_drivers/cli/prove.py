@@ -240,9 +240,8 @@ def _started(arguments: Sequence[str], name: str | None, place: Namespace, files
         process.send_signal(signal.SIGINT)
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(_ENDS_WITHIN_S)
-        if process.poll() is None:
-            process.kill()
-            process.wait()
+        process.kill()  # of no effect where it has ended
+        process.wait()
         thread.join()
         if process.stdout is not None:
             process.stdout.close()

@@ -45,8 +45,6 @@ Tables = Mapping[str, npt.NDArray[Any]]
 
 
 class _Growth:
-    """The growth of the counters of all buses or patches."""
-
     def __init__(self, names: list[str], counts: npt.NDArray[np.uint64]) -> None:
         self.names = names
         self.now: Numbers = counts.astype(np.int64)

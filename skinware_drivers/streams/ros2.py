@@ -256,7 +256,8 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
             except (ValueError, KeyError) as error:
                 topic, _ = self._reading.get(number, (None, None))
                 self.log_once(f"a message of {_in_ros(topic.name) if topic else f'topic {number}'}: {error}")
-                return [(self._identifier_of(number), stamp)]
+                own = (known for key, (known, _) in self._identifiers.items() if self._parts[key][0] == number)
+                return [(next(own, _NO_MESSAGE), stamp)]
             plan.listed = _LIST_EVERY if self._is_known(plan) else 0
         plan.messages += 1
         plan.listed -= 1
@@ -272,11 +273,6 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
     def _is_known(self, plan: Plan) -> bool:
         """Return whether all modules of a message are described in this form."""
         return all(self._identifiers.get((part.patch, part.name), (0, 0))[1] == part.form for part in plan.parts)
-
-    def _identifier_of(self, number: int) -> int:
-        """Return the identifier of a topic's first module."""
-        own = (known for key, (known, _) in self._identifiers.items() if self._parts[key][0] == number)
-        return next(own, _NO_MESSAGE)
 
     def _plan(self, number: int, sample: bytes) -> Plan:
         if number not in self._reading:

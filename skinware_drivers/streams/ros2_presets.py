@@ -123,7 +123,6 @@ def _cloud(message: CdrMessage, topic: str) -> Sequence[ModulePart]:
 
 
 def _image(message: CdrMessage, topic: str) -> Sequence[ModulePart]:
-    """Make a matrix of a picture."""
     encoding = message.texts["encoding"][()]
     match = _IMAGE.fullmatch(_NAMED_IMAGES.get(encoding, encoding))
     if match is None or match[1] + match[2] in ("64U", "64S", "8F", "16F"):

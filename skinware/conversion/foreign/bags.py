@@ -103,7 +103,6 @@ class BagSource(ColumnSource):
 
 
 def _columns(message: Any) -> dict[str, Any]:
-    """Return the numbers of a message by name."""
     kind = getattr(message, "__msgtype__", "")
     if kind == "sensor_msgs/msg/PointCloud2":
         return {**_column("header", message.header), **_points(message)}

@@ -337,7 +337,7 @@ _CLASSIC_ROW_BYTES, _FD_FRAME_BYTES = 16, 72
 """``struct can_frame`` and ``struct canfd_frame``; the kernel always hands out the whole of the latter."""
 
 
-class Rows:
+class MessageRows:
     """The arguments of ``recvmmsg`` for the rows of one batch; see ``rows_of``.
 
     The end of a CAN FD frame that is longer than a row goes into a scratch buffer.
@@ -389,12 +389,12 @@ class Rows:
         return found | self.cut(rows)
 
 
-_rows: WeakKeyDictionary[FrameBatch, Rows] = WeakKeyDictionary()
+_rows: WeakKeyDictionary[FrameBatch, MessageRows] = WeakKeyDictionary()
 
 
-def rows_of(batch: FrameBatch) -> Rows:
+def rows_of(batch: FrameBatch) -> MessageRows:
     """Return the arguments for a batch, made once: all buses that fill the batch share them."""
     rows = _rows.get(batch)
     if rows is None:
-        rows = _rows[batch] = Rows(batch)
+        rows = _rows[batch] = MessageRows(batch)
     return rows

@@ -1,7 +1,4 @@
-"""Emulated devices on one wire: their time, power and commands, and the faults of the frames that they send.
-
-:class:`skinware_drivers.virtual.hardware.EmulatedHardware` is the contract with the bus that carries the frames.
-"""
+"""Emulated devices on one wire: their time, power and commands, and the faults of the frames that they send."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ import msgspec
 import numpy as np
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.bus import check_identifier
+from skinware_drivers.bus import EXTENDED_FLAG, check_identifier
 from skinware_drivers.options import HasOptions
 from skinware_drivers.virtual.device import DATA, Device, EmulatorOptions, ForeignTraffic, Transmission, Wire
 from skinware_drivers.virtual.hardware import Event, EventLog, FrameDamage, WireFrame
@@ -27,7 +24,6 @@ if TYPE_CHECKING:  # needs MuJoCo
 
 OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
 
-_IDENTIFIER_MASK = 0x1FFF_FFFF
 _MOST_LISTED = 40
 _REPLY_NS = 200_000
 _LONGEST_CATCH_UP_NS = 1_000_000_000
@@ -113,7 +109,7 @@ class Stage(ABC, HasOptions[OptionsT]):
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         """Name the kind of a frame that a device sends, as the option ``silence`` does; by default its identifier."""
-        return f"0x{identifier & _IDENTIFIER_MASK:03x}"
+        return f"0x{identifier & ~EXTENDED_FLAG:03x}"
 
     def make_device(self, number: int, now_ns: int) -> Device:
         return Device(number, self.wire.attach(), now_ns, self.options.seed)
@@ -189,8 +185,7 @@ class Stage(ABC, HasOptions[OptionsT]):
                 return now_ns
             self.wire.run(event_ns)
             while self._scheduled and self._scheduled[0][0] <= event_ns:
-                _, action = self._scheduled.pop(0)
-                action(event_ns)
+                self._scheduled.pop(0)[1](event_ns)
             for device in self.devices.values():
                 for name, time_ns in device.due(event_ns):
                     self.on_timer(device, name, time_ns)
@@ -229,7 +224,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         self.lose_power_for_a_moment(self.device(number), now_ns)
         self.find_next_event()
 
-    # EmulatedHardware
+    # EmulatedHardware, the contract with the bus that carries the frames
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
         """Take one frame from the bus. Frames that mean nothing to the devices are ignored."""
@@ -353,30 +348,10 @@ class Stage(ABC, HasOptions[OptionsT]):
             return payload[: int(random.integers(0, max(1, len(payload))))]
         return random.bytes(len(payload)) if fault == "corrupted" else payload
 
-    def note_fault(
-        self,
-        device: Device,
-        time_ns: int,
-        where: tuple[int, int],
-        frame: tuple[int, bytes],
-        fault: FrameDamage,
-        reason: str,  # noqa: ARG002
-    ) -> None:
-        """Count and log a fault of a frame at ``where``: cycle, and position in the burst."""
-        self.counts["lost" if fault == "unsent" else fault] += 1
-        (cycle, position), (identifier, payload) = where, frame
-        self.log.append(
-            Event(
-                "frame_fault",
-                time_ns,
-                board=device.number,
-                cycle=cycle,
-                position=position,
-                identifier=identifier,
-                fault=fault,
-                payload=payload.hex(),
-            )
-        )
+    def note_fault(self, fault: Event, reason: str) -> None:  # noqa: ARG002
+        """Count and log a ``frame_fault``; ``reason``: why the frame was lost."""
+        self.counts["lost" if fault.fault == "unsent" else str(fault.fault)] += 1
+        self.log.append(fault)
 
     def _with_faults(
         self,
@@ -389,6 +364,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         """Return the frames that go to the wire, and the positions of those that take their time there and are lost."""
         faults = list(self.frame_faults.values())
         hit = device.random.random((len(identifiers), len(faults))) < chances
+        damage = partial(Event, "frame_fault", time_ns, board=device.number, cycle=device.cycle)
         sent_as: list[int] = []
         sent: list[bytes] = []
         lost: set[int] = set()
@@ -400,7 +376,8 @@ class Stage(ABC, HasOptions[OptionsT]):
             if fault is not None:
                 payload = self.spoil(fault, whole, device.random)
                 reason = "overflow" if fault == "unsent" else "random"
-                self.note_fault(device, time_ns, (device.cycle, position), (identifier, payload), fault, reason)
+                event = damage(position=position, identifier=identifier, fault=fault, payload=payload.hex())
+                self.note_fault(event, reason)
             if fault == "lost":
                 lost.add(len(sent_as))
             times = {"unsent": 0, "repeated": 2}.get(fault or "", 1)
@@ -411,9 +388,10 @@ class Stage(ABC, HasOptions[OptionsT]):
     def _lose_power(self, device: Device, now_ns: int, reason: str) -> None:
         device.alive = False
         for burst in device.queue:
+            lost = partial(Event, "frame_fault", now_ns, board=device.number, cycle=burst.cycle, fault="unsent")
             for at in range(burst.sent, len(burst.identifiers)):
                 if burst.cycle >= 0 and at not in burst.lost:
-                    frame = burst.identifiers[at], burst.payloads[at]
-                    self.note_fault(device, now_ns, (burst.cycle, at), frame, "unsent", reason)
+                    identifier, payload = burst.identifiers[at], burst.payloads[at].hex()
+                    self.note_fault(lost(position=at, identifier=identifier, payload=payload), reason)
         device.queue.clear()
         device.clear()

@@ -11,6 +11,7 @@ from functools import partial
 from typing import ClassVar, cast
 
 import numpy as np
+from msgspec.structs import replace
 
 from skinware.geometry import Geometry
 from skinware_drivers.bus import EXTENDED_FLAG
@@ -139,29 +140,21 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
         length = int(random.choice(_WRONG_LENGTHS))
         return payload[:length].ljust(length, b"\0")
 
-    def note_fault(
-        self,
-        device: Device,
-        time_ns: int,
-        where: tuple[int, int],
-        frame: tuple[int, bytes],
-        fault: FrameDamage,
-        reason: str,
-    ) -> None:
+    def note_fault(self, fault: Event, reason: str) -> None:
         """Count and log the fault of a half of a triangle."""
-        (cycle, position), (identifier, payload) = where, frame
-        half: Half = "tail" if (payload[0] & 0x80 if payload else position % 2) else "head"
-        place = partial(Event, time_ns=time_ns, board=device.number, triangle=identifier & 0xF, cycle=cycle, half=half)
-        if fault in ("lost", "unsent"):
+        payload, triangle = bytes.fromhex(fault.payload or ""), fault.identifier & 0xF
+        half: Half = "tail" if (payload[0] & 0x80 if payload else fault.position % 2) else "head"
+        place = partial(
+            Event, time_ns=fault.time_ns, board=fault.board, triangle=triangle, cycle=fault.cycle, half=half
+        )
+        if fault.fault in ("lost", "unsent"):
             self.counts["lost_halves"] += 1
             self.log.append(place("lost_half", reason=reason))
-        elif fault == "wrong_length":
+        elif fault.fault == "wrong_length":
             self.counts["wrong_lengths"] += 1
             self.log.append(place("wrong_length", length=len(payload)))
         else:
-            self.counts[fault] += 1
-            data = payload.hex()
-            self.log.append(place("frame_fault", position=position, identifier=identifier, fault=fault, payload=data))
+            super().note_fault(replace(fault, triangle=triangle, half=half), reason)
 
     def foreign_identifiers(self, random: np.random.Generator) -> Sequence[int]:  # noqa: ARG002
         """Return identifiers of other devices on the bus, none of them from the address of an emulated board.

@@ -111,8 +111,11 @@ def picture(browser: Browser, shown: Shown) -> Image.Image:
         until(page, READY, within_ms=PATIENCE_MS)
         page.evaluate(WATCH)
         page.wait_for_timeout(WATCHED_MS)
-        until(page, "window.score() > 0 && window.score() > 0.9 * window.best", within_ms=PATIENCE_MS)
-        with Image.open(io.BytesIO(page.locator("#view").screenshot())) as image:
+        shot = b""
+        while not shot or page.evaluate("window.score() <= 0"):  # it became stale: the machine is busy
+            until(page, "window.score() > 0 && window.score() > 0.9 * window.best", within_ms=PATIENCE_MS)
+            shot = page.locator("#view").screenshot()
+        with Image.open(io.BytesIO(shot)) as image:
             done = image.convert("RGB")
         page.close()
     return done

@@ -19,10 +19,9 @@ from skinware_drivers.decoding.decoder import Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types, uid_on_bus
 from skinware_drivers.layout import Layout
 from skinware_drivers.running.bus_line import BusLine
-from skinware_drivers.running.desk import RequestDesk, offered
 from skinware_drivers.running.generation import Generation, latency_for, make_watch
 from skinware_drivers.running.guard import Ending, hook
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher, RequestDesk, offered
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

@@ -72,9 +72,7 @@ class Recorded(NamedTuple):
 class ReplayedCanBus(VirtualCanBus):
     """A recorded CAN bus."""
 
-    @property
-    def name(self) -> str:
-        return f"bus {self.channel}"
+    name = Bus.name
 
 
 class RecordedPort(EmulatedPort):
@@ -106,9 +104,7 @@ class RecordedPort(EmulatedPort):
 class ReplayedSerialBus(EmulatedLine, SerialBus):
     """A recorded serial line."""
 
-    @property
-    def name(self) -> str:
-        return f"bus {self.channel}"
+    name = Bus.name
 
     def _open_port(self) -> RecordedPort:
         return RecordedPort(self.hardware, self._clock)
@@ -180,6 +176,7 @@ class ReplayedModbusBus(ModbusBus):
 
     opens_slowly = False
     is_recorded = True
+    name, asks = Bus.name, Bus.asks
 
     def __init__(
         self,
@@ -195,14 +192,6 @@ class ReplayedModbusBus(ModbusBus):
         self._hardware, self._over_tcp = hardware, over_tcp
         self._recorded: RecordedPort | None = None
         self._conversation = Conversation(self._wanted, self.counters, over_tcp=over_tcp)
-
-    @property
-    def name(self) -> str:
-        return f"bus {self.channel}"
-
-    @property
-    def asks(self) -> bool:
-        return False
 
     @property
     def reads_natively(self) -> bool:

@@ -203,8 +203,8 @@ def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any
     """Fingertips of board 1 send the slices, one per cycle; the first one until somebody reads, at the end the last."""
     from skinware_drivers.can.socketcan import SocketCanBus
     from skinware_drivers.cli.emulation import Emulation, SignalWatch
-    from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
     from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+    from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 
     begun = itertools.count()
     slice_of: dict[int, int] = {}

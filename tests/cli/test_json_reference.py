@@ -40,8 +40,8 @@ from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.cli.test_calibrate import calm_skin, finger_presses, force_session, gathered, stroked_state, strokes
 from tests.cli.test_contacts import touched_skin

@@ -14,8 +14,8 @@ from skinware.cli.press import command as press
 from skinware.geometry import read_geometry
 from skinware_drivers.cli.emulate import command as emulate
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 from tests.commands import run, running
 
 IDLE = "virtual?boards=7,8&pattern=idle"

@@ -21,8 +21,8 @@ from skinware_drivers.testing.driving import EmulatedSkin, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, WireFrame
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.cli.test_regions import placed_structure
 from tests.cli.test_sensor_health import looked_after

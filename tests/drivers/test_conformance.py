@@ -77,8 +77,8 @@ from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaServer
 from skinware_drivers.virtual.devices.yarp import EmulatedYarp
 from skinware_drivers.virtual.hardware import EventLog
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 from tests.drivers.fd_patch import EmulatedFdPatch, FdPatchDriver
 from tests.specification.path_tests import DriverConformance
 

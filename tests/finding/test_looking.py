@@ -35,8 +35,8 @@ from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm, Emula
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.hardware import EmulatedHardware, Event
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions as EmulatorOptions
 from tests.sdk.driving import Chatter, commands, emulated, troubled
 
 DRIVERS: dict[str, type[AnyAdapter]] = {"roboskin": RoboskinDriver}

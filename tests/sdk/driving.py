@@ -20,8 +20,8 @@ from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import EmulatedHardware, Event, WireFrame
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions as EmulatorOptions
 
 SILENCE_NS = 600_000_000
 """How long boards may be silent in tests: a busy machine lets the threads of a test wait for longer than 0.2 s."""

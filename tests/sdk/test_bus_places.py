@@ -17,8 +17,8 @@ from skinware_drivers.running.building import put_in_place
 from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions as EmulatorOptions
 
 pytestmark = pytest.mark.usefixtures("hurry")
 

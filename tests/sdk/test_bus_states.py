@@ -24,8 +24,8 @@ from skinware_drivers.running import bus_line, connection, news, runner
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.news import LINE_EVERY_S, LINES_AT_ONCE, BusNews
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 from tests.sdk.clock import Clock
 from tests.sdk.driving import TroubledBus, driving, emulated, follow, hardware_of, read_until
 

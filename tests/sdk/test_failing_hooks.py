@@ -23,8 +23,8 @@ from skinware_drivers.running import serving
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import Event
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions as EmulatorOptions
 from tests.sdk.driving import Driving, commands, driving, driving_lines, emulated, follow, hardware_of, troubled
 
 pytestmark = pytest.mark.usefixtures("hurry")

@@ -31,8 +31,8 @@ from skinware_drivers.running.generation import FlowLoop, FlowSelector
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.driving import Driving, carried_on, driving_lines
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions as EmulatorOptions
 from tests.sdk.cable import Cable
 from tests.sdk.driving import emulated, follow
 

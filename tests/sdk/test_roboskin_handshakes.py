@@ -13,8 +13,8 @@ from skinware_drivers.can.roboskin_options import Kind
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import Event
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions as EmulatorOptions
 from tests.sdk.conftest import HURRIED_WAIT_S
 from tests.sdk.driving import (
     Chatter,

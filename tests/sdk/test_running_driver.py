@@ -17,8 +17,8 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import Event
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions as EmulatorOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions as EmulatorOptions
 from tests.sdk.driving import EveryFrame, LateBoards, Together, commands, driving, emulated, hardware_of, read_until
 from tests.virtual.rig import damaged_cycles
 

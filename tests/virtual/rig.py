@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from skinware_drivers.virtual.hardware import Event, EventName, WireFrame
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
-from skinware_drivers.virtual.roboskin.touch import WireSource
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions, WireSource
 
 MS = 1_000_000
 START_NS = 5_000_000_000_000

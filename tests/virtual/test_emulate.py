@@ -22,8 +22,8 @@ from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.cli.emulate import command
 from skinware_drivers.cli.emulation import Emulation, SignalWatch, report_to, wait_readable
 from skinware_drivers.options import describe_options
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 
 from .rig import MS, START_NS
 

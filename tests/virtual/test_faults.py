@@ -10,8 +10,8 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.hardware import Event, JsonLinesLog, WireFrame
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 
 from .rig import MS, START_NS, Rig, cycles, damaged_cycles, is_data
 

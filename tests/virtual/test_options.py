@@ -10,8 +10,8 @@ import pytest
 import skinware_drivers
 from skinware.errors import ConfigurationError
 from skinware_drivers.options import describe_options, option_text, options_from_strings
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 
 
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -15,7 +15,7 @@ from skinware_drivers.can.roboskin_options import RoboskinOptions as DriverOptio
 from skinware_drivers.description import assemble
 from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus, virtual_bus
 from skinware_drivers.virtual.hardware import PlacedHardware, Pressing
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 
 from .rig import START_NS, Rig
 from .test_touch import TACTILE

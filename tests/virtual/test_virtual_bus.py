@@ -15,8 +15,8 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hand_clock import MonotonicClock
 from skinware_drivers.virtual.hardware import WireFrame
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
+from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 
 from .rig import MS
 

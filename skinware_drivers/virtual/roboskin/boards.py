@@ -20,8 +20,7 @@ from skinware_drivers.virtual.device import DATA as BURSTS
 from skinware_drivers.virtual.device import Device, Transmission
 from skinware_drivers.virtual.hardware import Event
 from skinware_drivers.virtual.roboskin.converters import Converters, TriangleFaults, TriangleState
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
-from skinware_drivers.virtual.roboskin.touch import TRIANGLES, PressedSkin, Touch, WireSource
+from skinware_drivers.virtual.roboskin.touch import TRIANGLES, EmulatedRoboskinOptions, PressedSkin, Touch, WireSource
 from skinware_drivers.virtual.stage import Stage
 
 GYROSCOPE_MESSAGE, ACCELEROMETER_MESSAGE, IMU_MESSAGE = 0, 1, 3

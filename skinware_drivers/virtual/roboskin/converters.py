@@ -19,8 +19,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
-from skinware_drivers.virtual.roboskin.touch import CHANNELS, DEFAULT_CDC_OFFSET, TRIANGLES, ArrayI, Touch
+from skinware_drivers.virtual.roboskin.touch import (
+    CHANNELS,
+    DEFAULT_CDC_OFFSET,
+    TRIANGLES,
+    ArrayI,
+    EmulatedRoboskinOptions,
+    Touch,
+)
 
 NOT_CONNECTED = 0xFFFF
 """Reading of I2C lines without a chip: the pull-ups."""

@@ -21,8 +21,14 @@ from skinware_drivers.virtual.hardware import Event, EventLog, FrameDamage, Half
 from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import TriangleState
 from skinware_drivers.virtual.roboskin.mtb import Mtb3, Mtb4
-from skinware_drivers.virtual.roboskin.options import EmulatedRoboskinOptions
-from skinware_drivers.virtual.roboskin.touch import CHANNELS, TRIANGLES, PressedSkin, WireSource, cycle_pattern
+from skinware_drivers.virtual.roboskin.touch import (
+    CHANNELS,
+    TRIANGLES,
+    EmulatedRoboskinOptions,
+    PressedSkin,
+    WireSource,
+    cycle_pattern,
+)
 from skinware_drivers.virtual.stage import Stage
 
 _CONFIGURED = (bytes.fromhex("4D0032F0"), bytes.fromhex("50000F02010022"), bytes.fromhex("0700"))

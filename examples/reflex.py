@@ -1,4 +1,6 @@
-"""Act on a touch within two frames: python reflex.py [NAMESPACE [JOINTS]]. Prints each event and the age of its frame.
+"""Act on a touch within two frames: python reflex.py [NAMESPACE [JOINTS]].
+
+Prints each event, and the age of its frame before and after the action.
 
 JOINTS is the service of the hand's joints, in the default namespace, which stops at the request ``hold``: that of a
 simulated hand (``skin-emulate --world mujoco:gripper``), or one that the program of your hand publishes.
@@ -36,7 +38,8 @@ def main() -> None:
                 act(joints)
             elif event.kind in (EventKind.WITHDRAWN, EventKind.ENDED):
                 begun.discard(event.contact.id)
-            print(event.kind.name.lower(), event.contact.id, f"{age_us:.0f} us", flush=True)
+            acted_us = (now_ns() - event.acquired_ns) / 1000
+            print(event.kind.name.lower(), event.contact.id, f"{age_us:.0f} us, {acted_us:.0f} us", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -17,6 +18,7 @@ import tempfile
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,13 +41,11 @@ module = [
 """
 
 
-def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float], list[float], list[float], int]:
-    """Close the gripper again and again.
+Stages = dict[str, list[float]]
 
-    Returns:
-        From contact to command, and from the frame of the first event to that event, ms; the forces 0.5 s later, N; and
-        the number of misses.
-    """
+
+def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[Stages, list[float], int]:
+    """Close the gripper again and again; return the stages, ms, the forces 0.5 s later, N, and the misses."""
     scenes = ROOT / "skinware_drivers" / "virtual" / "physics" / "scenes"
     binding, port = folder / "gripper.toml", folder / "port"
     binding.write_text(BINDING.format(scenes=scenes, grid="rows = 7, columns = 4, pitch_m = [0.005, 0.005]"))
@@ -56,7 +56,8 @@ def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float],
         ("skin-calm", "robotiq_tsf", "--into", calm),
         (sys.executable, str(ROOT / "examples" / "reflex.py"), calm, "joints"),
     ]
-    random, late_ms, age_ms, pressed_n, missed = np.random.default_rng(seed), [], [], [], 0
+    random, pressed_n, missed = np.random.default_rng(seed), [], 0
+    late: Stages = {name: [] for name in ("contact to frame", "frame to event", "event to command", "all")}
     with ExitStack() as stack:
         for number, command in enumerate(commands):
             output = stack.enter_context((folder / f"log{number}").open("w"))
@@ -75,21 +76,34 @@ def run(closings: int, seed: int, folder: Path, calm: str) -> tuple[list[float],
             seen = len((folder / "log3").read_text().splitlines())
             asked_s = float(joints.request().column("commanded_s")[0])
             joints.call("move", targets={"close": 0.025}, seconds=float(random.uniform(0.8, 2.5)))
-            asked_s, touched_s = max(asked_s, float(joints.request().column("commanded_s")[0])), np.nan
-            until = time.monotonic() + 4
-            while time.monotonic() < until and np.isnan(touched_s):
-                touched_s = float(truth.read(timeout_s=5).column("touched_s")[0])
-            time.sleep(0.5)
-            begun = [line.split() for line in (folder / "log3").read_text().splitlines()[seen:]]
-            ages = [float(age) / 1e3 for kind, _, age, _ in begun if kind in ("onset", "confirmed")]
-            commanded_s = float(joints.request().column("commanded_s")[0])
-            if commanded_s > asked_s and ages:
-                age_ms.append(ages[0])
-                late_ms.append(1e3 * (commanded_s - touched_s))
+            asked_s = max(asked_s, float(joints.request().column("commanded_s")[0]))
+            commanded_s, until = _first_command_s(joints, asked_s), time.monotonic() + 0.5
+            touched_s = float(truth.request().column("touched_s")[0])
+            time.sleep(max(0.0, until - time.monotonic()))
+            lines = (folder / "log3").read_text().splitlines()[seen:]
+            begun = [re.findall(r"[\d.]+", line) for line in lines if line.startswith(("onset", "confirmed"))]
+            if commanded_s > asked_s and begun:
+                all_ms = 1e3 * (commanded_s - touched_s)
+                event_ms, acted_ms = (float(number) / 1e3 for number in begun[0][1:])
+                stages_ms = all_ms - acted_ms, event_ms, acted_ms - event_ms, all_ms
+                for of_stage, stage_ms in zip(late.values(), stages_ms, strict=True):
+                    of_stage.append(stage_ms)
                 pressed_n.append(float(truth.request().column("force_n")[0]))
             else:
                 missed += 1
-    return late_ms, age_ms, pressed_n, missed
+    return late, pressed_n, missed
+
+
+def _first_command_s(joints: ServiceReader[Any], asked_s: float) -> float:
+    """Return the time of the scene at the first command after one; NaN: none came within 4 s."""
+    until = time.monotonic() + 4
+    for sample in joints.in_order(timeout_s=5):
+        commanded_s = float(sample.column("commanded_s")[0])
+        if commanded_s > asked_s:
+            return commanded_s
+        if time.monotonic() > until:
+            break
+    return float("nan")
 
 
 def main() -> None:
@@ -102,23 +116,18 @@ def main() -> None:
     os.environ["SKINWARE_NAMESPACE"] = source.name
     try:
         with tempfile.TemporaryDirectory() as folder:
-            late_ms, age_ms, pressed_n, missed = run(arguments.closings, arguments.seed, Path(folder), calm.name)
+            late, pressed_n, missed = run(arguments.closings, arguments.seed, Path(folder), calm.name)
     finally:
         for namespace in (source, calm):
             shutil.rmtree(namespace.path, ignore_errors=True)
-    if late_ms:
-        rest_ms = np.subtract(late_ms, age_ms)
+    if pressed_n:
         print(
             f"{PERIOD_MS} ms a frame, load {os.getloadavg()[0]:.1f}, ms:\n\n| | p50 | p99 | most |\n|---|---|---|---|"
         )
-        for name, stage in (
-            ("contact to command", late_ms),
-            ("from the frame to its event", age_ms),
-            ("the others: contact to frame, event to command", rest_ms),
-        ):
-            print(f"| {name} | {' | '.join(f'{one:.1f}' for one in np.percentile(stage, [50, 99, 100]))} |")
+        for name, of_stage in late.items():
+            print(f"| {name} | {' | '.join(f'{one:.1f}' for one in np.percentile(of_stage, [50, 99, 100]))} |")
         print(f"\nit then presses {np.median(pressed_n):.2f} N")
-    print(f"{len(late_ms)} closings stopped, {missed} not")
+    print(f"{len(pressed_n)} closings stopped, {missed} not")
 
 
 if __name__ == "__main__":

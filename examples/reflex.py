@@ -39,7 +39,7 @@ def main() -> None:
             elif event.kind in (EventKind.WITHDRAWN, EventKind.ENDED):
                 begun.discard(event.contact.id)
             acted_us = (now_ns() - event.acquired_ns) / 1000
-            print(event.kind.name.lower(), event.contact.id, f"{age_us:.0f} us, {acted_us:.0f} us", flush=True)
+            print(event.kind.name.lower(), event.contact.id, f"{age_us:.0f} us {acted_us:.0f} us", flush=True)
 
 
 if __name__ == "__main__":

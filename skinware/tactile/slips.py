@@ -114,6 +114,8 @@ class Slips:
         self._id_of[taxels] = identity[contact]
         moved = (was > 0) & (self._id_of > 0) & (was != self._id_of)
         moved |= ((was > 0) | (self._id_of > 0)) & (known_before != self._is_known)
+        if not moved.any():
+            return np.zeros(len(identity), bool)
         other: Flags = np.isin(identity, np.concatenate([was[moved], self._id_of[moved]]))
         return other
 

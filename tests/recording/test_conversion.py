@@ -32,20 +32,9 @@ from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.recording.damaging import frames_of, with_a_bad_chunk
 from tests.recording.made import MadeSource, MadeTable, generation_of_service, made_recording
-from tests.recording.rig import recording, two_drivers_and_a_service
+from tests.recording.rig import recording
 
 ARRAYS = ("npz", "parquet", "hdf5")
-
-
-@pytest.fixture
-def path(tmp_path: Path, made: dict[str, bytes]) -> Path:
-    """Two drivers and a service."""
-    file = tmp_path / "skin.mcap"
-    if not made:
-        two_drivers_and_a_service(file)
-        made["skin"] = file.read_bytes()
-    file.write_bytes(made["skin"])
-    return file
 
 
 def whole(table: Table) -> dict[str, npt.NDArray[Any]]:

@@ -18,18 +18,6 @@ from skinware.errors import BadRecording, ConfigurationError, StructureError
 from skinware.recording.mcap_writing import MAGIC
 from skinware.tactile.regions import Region, Regions
 from tests.commands import PATIENCE_S
-from tests.recording.rig import two_drivers_and_a_service
-
-
-@pytest.fixture
-def path(tmp_path: Path, made: dict[str, bytes]) -> Path:
-    """Two drivers and a service, one and a half seconds long; made by the first test that wants it."""
-    file = tmp_path / "skin.mcap"
-    if not made:
-        two_drivers_and_a_service(file)
-        made["skin"] = file.read_bytes()
-    file.write_bytes(made["skin"])
-    return file
 
 
 def test_columns_frames_and_snapshots_tell_the_same(path: Path) -> None:

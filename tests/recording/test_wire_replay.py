@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +58,6 @@ DRIVERS = (
     "weiss_wts",
     "wuji_glove",
 )
-
-
-@pytest.fixture
-def cable() -> Iterator[Cable]:
-    cable = Cable()
-    yield cable
-    cable.close()
 
 
 def record(path: Path, adapter: AnyAdapter, bus: Bus, frames: int, *, updates: int = 0) -> Series:
@@ -157,6 +150,12 @@ def item(at_ms: float, identifier: int | None, data: bytes = b"", *, is_sent: bo
     return WireItem(7_000 * MS + round(at_ms * MS), 0, is_sent, identifier, 0, data)
 
 
+def begun(items: Sequence[WireItem], **how: Any) -> RecordedWire:
+    wire = RecordedWire(iter(items), 7_000 * MS, **how)
+    wire.skip(0)
+    return wire
+
+
 def emitted(wire: RecordedWire, until_ms: float, step_ms: float = 1.0) -> list[tuple[float, int]]:
     """(ms, identifier) of what is given by then, if somebody looks each ms."""
     found = []
@@ -177,8 +176,7 @@ def test_frames_come_with_their_own_times() -> None:
 
 
 def test_speed() -> None:
-    wire = RecordedWire(iter([item(0, 1), item(10, 2), item(30, 3)]), 7_000 * MS, speed=2.0)
-    wire.skip(0)
+    wire = begun([item(0, 1), item(10, 2), item(30, 3)], speed=2.0)
     assert emitted(wire, 30) == [(0, 1), (5, 2), (15, 3)]
 
 
@@ -196,8 +194,7 @@ def test_at_full_speed_only_questions_are_waited_for() -> None:
 
 def test_an_answer_comes_after_its_question_with_the_same_delay() -> None:
     items = [item(0, 0x10, is_sent=True), item(2, 0x20), item(50, 0x10, is_sent=True), item(52, 0x20)]
-    wire = RecordedWire(iter(items), 7_000 * MS)
-    wire.skip(0)
+    wire = begun(items)
     assert emitted(wire, 30) == []
     wire.receive(0x11, b"", 30 * MS)  # another question
     assert wire.emit(31 * MS) == []
@@ -211,8 +208,7 @@ def test_an_answer_comes_after_its_question_with_the_same_delay() -> None:
 
 def test_a_question_that_is_repeated_is_not_taken_for_the_next_one() -> None:
     items = [item(0, 0x10, b"a", is_sent=True), item(2, 1), item(10, 0x10, b"b", is_sent=True), item(12, 2)]
-    wire = RecordedWire(iter(items), 7_000 * MS)
-    wire.skip(0)
+    wire = begun(items)
     wire.receive(0x10, b"a", 1 * MS)
     wire.receive(0x10, b"a", 2 * MS)  # its answer was not here yet
     assert [(frame.time_ns, frame.identifier) for frame in wire.emit(40 * MS)] == [(3 * MS, 1)]
@@ -222,8 +218,7 @@ def test_a_question_that_is_repeated_is_not_taken_for_the_next_one() -> None:
 
 def test_a_question_that_is_not_asked_any_more_is_waited_for_once() -> None:
     items = [item(0, 0x10, is_sent=True), item(1, 1), item(10, 0x10, is_sent=True), item(11, 2)]
-    wire = RecordedWire(iter(items), 7_000 * MS)
-    wire.skip(0)
+    wire = begun(items)
     assert wire.next_due_ns() == 2000 * MS
     assert emitted(wire, 2100) == [(2001, 1), (2011, 2)]
 
@@ -231,8 +226,7 @@ def test_a_question_that_is_not_asked_any_more_is_waited_for_once() -> None:
 def test_a_question_that_comes_earlier_than_it_did_is_answered_at_once() -> None:
     """Whoever was held up when it was recorded: the answer came in time then, and must do so now."""
     items = [item(0, 0x10, b"a", is_sent=True), item(1, 1), item(900, 0x10, b"b", is_sent=True), item(902, 2)]
-    wire = RecordedWire(iter(items), 7_000 * MS)
-    wire.skip(0)
+    wire = begun(items)
     wire.receive(0x10, b"a", 0)
     assert emitted(wire, 5) == [(1, 1)]
     wire.receive(0x10, b"b", 6 * MS)
@@ -245,8 +239,7 @@ def test_a_question_that_comes_earlier_than_it_did_is_answered_at_once() -> None
 def test_an_answer_that_was_read_late_comes_soon_after_its_question() -> None:
     """Whoever was held up read it late, and took it. Whoever is not would have given it up by then."""
     items = [item(0, 0x10, b"a", is_sent=True), item(300, 1), item(301, 2), item(310, 0x10, b"b", is_sent=True)]
-    wire = RecordedWire(iter([*items, item(315, 0x10, b"c", is_sent=True), item(329, 3)]), 7_000 * MS)
-    wire.skip(0)
+    wire = begun([*items, item(315, 0x10, b"c", is_sent=True), item(329, 3)])
     wire.receive(0x10, b"a", 0)
     assert emitted(wire, 60) == [(20, 1), (21, 2)]
     wire.receive(0x10, b"b", 60 * MS)
@@ -256,8 +249,7 @@ def test_an_answer_that_was_read_late_comes_soon_after_its_question() -> None:
 
 def test_an_answer_comes_at_once_to_who_asks_again() -> None:
     items = [item(0, 0x10, b"a", is_sent=True), item(15, 1), item(16, 2), item(20, 0x10, b"a", is_sent=True)]
-    wire = RecordedWire(iter([*items, item(21, 3)]), 7_000 * MS)
-    wire.skip(0)
+    wire = begun([*items, item(21, 3)])
     wire.receive(0x10, b"a", 0)
     assert emitted(wire, 9) == []
     wire.receive(0x10, b"a", 10 * MS)
@@ -269,8 +261,7 @@ def test_an_answer_comes_at_once_to_who_asks_again() -> None:
 
 def test_what_comes_by_itself_comes_at_its_time_whatever_is_asked() -> None:
     items = [item(0, 0x10, is_sent=True), item(2, 1), item(50, 2), item(100, 3)]
-    wire = RecordedWire(iter(items), 7_000 * MS)
-    wire.skip(0)
+    wire = begun(items)
     wire.receive(0x10, b"", 0)
     assert emitted(wire, 10) == [(2, 1)]
     wire.receive(0x10, b"", 10 * MS)
@@ -279,20 +270,17 @@ def test_what_comes_by_itself_comes_at_its_time_whatever_is_asked() -> None:
 
 
 def test_who_only_listens_is_not_waited_for() -> None:
-    wire = RecordedWire(iter([item(0, 0x10, is_sent=True), item(1, 1)]), 7_000 * MS, waits=False)
-    wire.skip(0)
+    wire = begun([item(0, 0x10, is_sent=True), item(1, 1)], waits=False)
     assert emitted(wire, 2) == [(1, 1)]
 
 
 def test_error_and_remote_frames_are_not_sent_again() -> None:
-    wire = RecordedWire(iter([item(0, ERROR_FLAG | 4, bytes(8)), item(0, REMOTE_FLAG | 5), item(0, 6)]), 7_000 * MS)
-    wire.skip(0)
+    wire = begun([item(0, ERROR_FLAG | 4, bytes(8)), item(0, REMOTE_FLAG | 5), item(0, 6)])
     assert emitted(wire, 1) == [(0, 6)]
 
 
 def test_the_end_is_told(caplog: pytest.LogCaptureFixture) -> None:
-    wire = RecordedWire(iter([item(0, 1)]), 7_000 * MS, name="replay:walk.mcap (can0)")
-    wire.skip(0)
+    wire = begun([item(0, 1)], name="replay:walk.mcap (can0)")
     emitted(wire, 1)
     emitted(wire, 1)
     assert [record.message for record in caplog.records] == ["replay:walk.mcap (can0): the recording is over"]

@@ -70,13 +70,6 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def cable() -> Iterator[Cable]:
-    cable = Cable()
-    yield cable
-    cable.close()
-
-
-@pytest.fixture
 def spare() -> Iterator[Cable]:
     cable = Cable()
     yield cable

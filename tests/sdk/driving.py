@@ -12,7 +12,7 @@ from skinware import status
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
-from skinware.status import BusReason
+from skinware.status import BusReason, Status
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_options import RoboskinOptions
 from skinware_drivers.running.building import PublishMode
@@ -218,6 +218,14 @@ class TroubledBus(VirtualCanBus):
 
 def troubled(log: list[Event] | None = None, **options: Any) -> TroubledBus:
     return TroubledBus("", hardware=EmulatedRoboskin(EmulatorOptions(**options), log=log))
+
+
+def is_whole(frame: DriverSnapshot) -> bool:
+    return not (frame.status & (Status.STALE | Status.NEVER_SEEN)).any()
+
+
+def later_than(last: DriverSnapshot) -> Callable[[DriverSnapshot], bool]:
+    return lambda frame: frame.sequence > last.sequence
 
 
 def follow(reader: DriverReader, condition: Callable[[Any], bool]) -> Any:

@@ -292,6 +292,10 @@ RAW_XELA = Case(
 )
 
 
+def case_of(type_name: str) -> Case:
+    return next(case for case in CASES if case.type_name == type_name)
+
+
 def serialized(sample: Any) -> bytes:
     """The sample as it is on the wire."""
     return bytes(sample.serialize())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import Running, refused, run, running
 from tests.ros2.alone import own_domain
-from tests.sdk.driving import follow
+from tests.sdk.driving import follow, later_than
 from tests.streams.dex3_peer import LEAST, PADS, TAXELS, Edition, pressure, temperature
 
 N = 2 * TAXELS * PADS
@@ -73,10 +73,6 @@ def require_exact(frame: DriverSnapshot, hands: tuple[int, ...] = (0, 1)) -> Non
         assert values.tolist() == expected(number_of(frame, hand, place * N), hand)
 
 
-def _later_than(last: DriverSnapshot) -> Callable[[DriverSnapshot], bool]:
-    return lambda frame: frame.sequence > last.sequence
-
-
 def is_good(frame: DriverSnapshot) -> bool:
     return not frame.status.any()
 
@@ -94,7 +90,7 @@ def test_both_hands_value_by_value(domain: int) -> None:
         ]
         for _ in range(20):
             require_exact(frame)
-            frame = read_until(skin.reader, _later_than(frame))
+            frame = read_until(skin.reader, later_than(frame))
 
 
 @pytest.mark.thorough
@@ -117,7 +113,7 @@ def test_nothing_is_lost_at_500_hz_beside_a_second_reader(domain: int) -> None:
         while number_of(frame, 0) < count - 1 or number_of(frame, 1, N) < count - 1:
             require_exact(frame)
             seen += sum(len(second.take(1000)) for second in seconds)
-            frame = read_until(skin.reader, _later_than(frame))
+            frame = read_until(skin.reader, later_than(frame))
         there.wait_for("done")
         frame = read_until(skin.reader, lambda f: skin.reader.bus_counters(f)[0]["frames"] == before + 2 * PADS * count)
         [counters] = skin.reader.bus_counters(frame)
@@ -199,8 +195,7 @@ def test_nothing_is_published(domain: int) -> None:
     writer = DataWriter(ours, Topic(ours, "rt/dex3/left/state", edition.hand))
     with driven(domain, hands="left") as skin:
         wait_until(lambda: writer.get_publication_matched_status().current_count == 1)
-        writer.write(edition.sample(0, 0))
-        read_until(skin.reader, is_good)
+        read_until(skin.reader, lambda frame: writer.write(edition.sample(0, 0)) or is_good(frame))
         read = {one.topic_name for one in subscriptions.take(100) if not one.topic_name.startswith("DCPS")}
         assert read == {"rt/dex3/left/state"}
         assert {one.participant_key for one in publications.take(100)} == {ours.guid}

@@ -32,7 +32,7 @@ from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import refused, run, running
 from tests.ros2.alone import own_domain
-from tests.sdk.driving import follow
+from tests.sdk.driving import follow, is_whole, later_than
 from tests.streams.ros2_peer import (
     CASES,
     RAW_XELA,
@@ -41,6 +41,7 @@ from tests.streams.ros2_peer import (
     Header,
     TactileState,
     Time,
+    case_of,
     header,
     message,
     ramp,
@@ -95,18 +96,6 @@ def published(domain: int, case: Case, topic: str = "rt/touch", **more: Any) -> 
 
 def driven(domain: int, **options: Any) -> Any:
     return emulated_skin("ros2", bus=f"dds://{domain}", driver_options={"learn_s": 0.2, **options})
-
-
-def case_of(type_name: str) -> Case:
-    return next(case for case in CASES if case.type_name == type_name)
-
-
-def is_whole(frame: DriverSnapshot) -> bool:
-    return not (frame.status & (Status.STALE | Status.NEVER_SEEN)).any()
-
-
-def later_than(last: DriverSnapshot) -> Callable[[DriverSnapshot], bool]:
-    return lambda frame: frame.sequence > last.sequence
 
 
 def test_every_known_message_has_its_peer() -> None:

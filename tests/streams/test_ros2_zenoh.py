@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from skinware import DriverReader, DriverSnapshot, Namespace
+from skinware import DriverReader, Namespace
 from skinware.errors import ConfigurationError
 from skinware.ros2.rmw_zenoh import MessageAttachment, ZenohNode
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
@@ -27,7 +27,8 @@ from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import run, running
 from tests.ros2.router import Router, router, sockets
 from tests.ros2.sdk_peer import sdk_peer
-from tests.streams.ros2_peer import CASES, Case, same, serialized
+from tests.sdk.driving import is_whole, later_than
+from tests.streams.ros2_peer import Case, case_of, same, serialized
 
 HASH = f"RIHS01_{0:064x}"
 TIMED = Qos(depth=10)
@@ -92,18 +93,6 @@ def published(at: Router, case: Case, topic: str = "/touch", domain: int = 0, **
 def driven(at: Router, domain: int, **options: Any) -> Any:
     bus = f"ros2://{domain}?router={at.endpoint}"
     return emulated_skin("ros2", bus=bus, driver_options={"learn_s": 0.2, **options})
-
-
-def case_of(type_name: str) -> Case:
-    return next(case for case in CASES if case.type_name == type_name)
-
-
-def is_whole(frame: DriverSnapshot) -> bool:
-    return not (frame.status & (Status.STALE | Status.NEVER_SEEN)).any()
-
-
-def later_than(last: DriverSnapshot) -> Callable[[DriverSnapshot], bool]:
-    return lambda frame: frame.sequence > last.sequence
 
 
 @pytest.mark.parametrize("distro", list(Distro))

@@ -119,6 +119,24 @@ class _BlankScreen(Screen[None]):
     BLANK = True
 
 
+class _Bell:
+    """Wakes what sleeps on its futex in another thread, or waits for ``rung`` in the loop."""
+
+    def __init__(self) -> None:
+        self.rung = asyncio.Event()
+        self._count = np.zeros(1, np.uint32)
+        self._word = Word(self._count.view(np.uint8), 0)
+
+    @property
+    def wake_word(self) -> tuple[Word, int]:
+        return self._word, int(self._count[0])
+
+    def ring(self) -> None:
+        self.rung.set()
+        self._count += 1
+        self._word.wake_all()
+
+
 class SkinTop(App[None]):
     """Show drivers, buses and patches, and a picture of the sensors under the cursor."""
 
@@ -180,12 +198,10 @@ class SkinTop(App[None]):
         self._lines = {name: Static(id=name, markup=False) for name in _LINES}
         self._is_worst_first = True
         self._pointed: int | None = None
-        self._bell = np.zeros(1, np.uint32)
-        self._bell_word = Word(self._bell.view(np.uint8), 0)
-        self._asked, self._must_draw = asyncio.Event(), True
+        self._bell, self._must_draw = _Bell(), True
         self._drawn: DriverSnapshot | None = None
         self._listed: tuple[object, ...] = ()
-        self._drawn_s = self._used_s = 0.0
+        self._drawn_s = 0.0, 0.0  # by the clock, and of the processor
 
     def get_default_screen(self) -> Screen[None]:
         return _BlankScreen(id="_default")
@@ -272,24 +288,21 @@ class SkinTop(App[None]):
 
     def _draw_soon(self) -> None:
         self._must_draw = True
-        self._asked.set()
-        self._bell += 1
-        self._bell_word.wake_all()
+        self._bell.ring()
 
     async def _follow(self) -> None:
         """Draw the picture whenever the chosen driver publishes, or something asks for it; else sleep."""
         while True:
             driver = self._driver_of(self._list.chosen) if self._list.chosen else None
-            words = [(self._bell_word, int(self._bell[0]))]
-            words += [] if driver is None else [driver.wake_word]
-            self._asked.clear()
+            words = [self._bell.wake_word, *([] if driver is None else [driver.wake_word])]
+            self._bell.rung.clear()
             self._update_picture()
             await asyncio.to_thread(sleep_on, words, now_ns() + _LONGEST_SLEEP_NS)
             await asyncio.sleep(1 / _REDRAWS_HZ)
-            used_s = time.process_time() - self._used_s
-            rest_s = self._drawn_s + min(used_s / _SHARE, _LONGEST_REST_S) - time.monotonic()
+            drawn_s, used_s = self._drawn_s
+            rest_s = drawn_s + min((time.process_time() - used_s) / _SHARE, _LONGEST_REST_S) - time.monotonic()
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._asked.wait(), max(0.0, rest_s))
+                await asyncio.wait_for(self._bell.rung.wait(), max(0.0, rest_s))
 
     def _driver_of(self, row: ListRow) -> LiveDriver | None:
         return self._overview.drivers.get(row.key.driver)
@@ -349,7 +362,7 @@ class SkinTop(App[None]):
         is_newer, self._drawn = frame is not self._drawn, frame
         if frame is None or not (is_newer or self._must_draw):
             return
-        self._must_draw, self._drawn_s, self._used_s = False, time.monotonic(), time.process_time()
+        self._must_draw, self._drawn_s = False, (time.monotonic(), time.process_time())
         picture.draw(row.key, frame, size.width, size.height, LIVE if is_newer else life_of(driver.reader, frame))
         self._show_contacts(driver)
         hidden = 0 if picture.arrangement is None else picture.arrangement.lines - size.height

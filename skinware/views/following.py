@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report_of, settling, status_now
+from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report_of, status_now
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
@@ -21,106 +21,16 @@ from skinware.tactile.motion import MotionReader, MotionSample
 from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
 from skinware.views.live import EverySnapshot, LiveDriver, LiveDrivers, LiveSources
-from skinware.views.quantities import WITHOUT_VALUE, Quantity, physical_values, quantities_of
+from skinware.views.quantities import Newest, Quantity, quantities_of
 from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
-_Made = TypeVar("_Made")
 _JUDGE_EVERY_NS = NS_PER_S // 5
 _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _EARLY_NS = 5_000_000
 """A snapshot may be taken this much earlier than the pace asks for."""
-_UNHEALTHY, _NEVER_SEEN, _ALL_BITS = np.uint8(Status.UNHEALTHY), np.uint8(Status.NEVER_SEEN), np.uint8(0xFF)
-
-
-@dataclass(eq=False)
-class Newest:
-    """The newest snapshot of a driver, and what is known about it now.
-
-    Attributes:
-        status: (n_sensors,) uint8, status of its sensors now, with the health that the calmed driver publishes.
-        calm: snapshot of the calmed driver, if it lives and has the same sensors.
-        all: snapshots since the last one that was newest, of the calmed driver where there is one; the newest last.
-        contacts, motion: on the driver; None where no service publishes them.
-        shared: results that several viewers need, by a key of their own.
-    """
-
-    frame: DriverSnapshot
-    status: npt.NDArray[np.uint8]
-    calm: DriverSnapshot | None
-    contacts: ContactsSample | None
-    motion: MotionSample | None
-    all: Sequence[DriverSnapshot]
-    shared: dict[object, Any] = field(default_factory=dict)
-
-    def once(self, key: object, make: Callable[[], _Made]) -> _Made:
-        if key not in self.shared:
-            self.shared[key] = make()
-        made: _Made = self.shared[key]
-        return made
-
-    def physical(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]]:
-        """Return (n,) values of a quantity's sensors in its unit."""
-        return self.once(("physical", quantity.name), lambda: self.frame.physical(quantity.type.name))
-
-    def all_physical(self) -> npt.NDArray[np.float32]:
-        """Return (n_sensors,) float32, values of the sensors of all types, each in its unit."""
-        return self.once("all", lambda: physical_values(self.frame))
-
-    def above_baseline(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]] | None:
-        """Return (n,) how far values are above their baselines, 0 without touch; None without a calmed driver."""
-        calm = self.calm
-        if calm is None:
-            return None
-        return self.once(("calm", quantity.name), lambda: calm.physical(quantity.type.name))
-
-    @property
-    def contacts_position(self) -> tuple[int, int] | None:
-        return None if self.contacts is None else self.contacts.position
-
-    @property
-    def why(self) -> npt.NDArray[np.uint8]:
-        """(n_sensors,) uint8: a :class:`skinware.status.Why` for each, of the calmed driver."""
-        return (self.calm or self.frame).why
-
-    @property
-    def settling(self) -> npt.NDArray[np.bool_]:
-        """(n_sensors,) bool: those whose baselines the calmed driver does not know yet."""
-        return self.once("settling", lambda: settling(self.calm or self.frame))
-
-    @property
-    def marked(self) -> npt.NDArray[np.uint8]:
-        """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
-        return self.once(
-            "marked", lambda: np.where(self.settling & ((self.status & _NEVER_SEEN) != 0), _ALL_BITS, self.status)
-        )
-
-    def highest_change(self, quantity: Quantity, rest: npt.NDArray[np.float32]) -> npt.NDArray[np.floating[Any]]:
-        """Return (n,) the greatest distance of fresh values from ``rest``, or above baselines, in all snapshots."""
-        changes = np.stack([frame.physical(quantity.type.name) for frame in self.all])
-        if self.calm is None:
-            changes -= rest[quantity.where]
-        fresh = np.stack([frame.status[quantity.where] for frame in self.all]) == 0
-        highest: npt.NDArray[np.floating[Any]] = np.where(fresh, np.nan_to_num(np.abs(changes)), 0).max(axis=0)
-        return highest
-
-    def totals(self, quantity: Quantity, rest: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float64] | None:
-        """Return (k, n_pads) the load on each pad in each of ``all``, the sum or the highest of its values.
-
-        Args:
-            rest: (n_sensors,) values at rest that are taken off; None: none are.
-
-        Returns:
-            None where values are no loads: counts, but on a hand or beside a calmed driver, and other quantities.
-        """
-        if self.calm is None and not quantity.has_loads:
-            return None
-        loads = np.stack([frame.physical(quantity.type.name) for frame in self.all])
-        if self.calm is None and rest is not None:
-            loads -= rest[quantity.where]
-        without = np.stack([frame.status[quantity.where] for frame in self.all]) & WITHOUT_VALUE
-        return quantity.totals(np.where(without == 0, np.nan_to_num(loads), 0))
+_UNHEALTHY = np.uint8(Status.UNHEALTHY)
 
 
 class Origin:
@@ -234,10 +144,8 @@ class ShownDriver:
         self.changes = 0
         self.since_ns: dict[tuple[object, ...], int] = {}
         self.taken_ns = self._judged_ns = 0
-        self._calm_pair: tuple[Structure | None, Structure | None, bool] = (None, None, False)
         self.newest: Newest | None = None
-        self._every = EverySnapshot(origin.namespace, live.name)
-        self._every_calm = EverySnapshot(origin.calm or origin.namespace, live.name)
+        self._every = EverySnapshot(live.name)
         self.structure, self.generation = live.structure, live.reader.generation
         self.quantities = quantities_of(self.structure)
         self.past, self.rest = RecentValues(self.structure.n_sensors, self.structure.dtype), DriverRest(self.structure)
@@ -304,7 +212,6 @@ class ShownDriver:
 
     def close(self) -> None:
         self._every.close()
-        self._every_calm.close()
 
     def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8], *, is_newer: bool = False) -> Newest:
         self._judged_ns = now_ns()
@@ -313,18 +220,14 @@ class ShownDriver:
             calm = None
         if calm is not None:
             status = status | (calm.status & _UNHEALTHY)
-        every, last = (self._every, frame) if calm is None else (self._every_calm, calm)
-        return Newest(frame, status, calm, contacts, motion, every.until(last) if is_newer else [last])
+        origin, last = self.origin, calm or frame
+        namespace = origin.namespace if calm is None or origin.calm is None else origin.calm
+        return Newest(frame, status, calm, contacts, motion, self._every.until(last, namespace) if is_newer else [last])
 
     def _fits(self, calm: Structure) -> bool:
-        """Return whether a calmed driver has the same sensors; the comparison is made once for two structures."""
-        known_calm, known, fits = self._calm_pair
-        if known_calm is not calm or known is not self.structure:
-            fits = np.array_equal(calm.sensor_uid, self.structure.sensor_uid) and np.array_equal(
-                calm.sensor_type, self.structure.sensor_type
-            )
-            self._calm_pair = calm, self.structure, fits
-        return fits
+        """Return whether a calmed driver has the same sensors."""
+        own = self.structure
+        return np.array_equal(calm.sensor_uid, own.sensor_uid) and np.array_equal(calm.sensor_type, own.sensor_type)
 
 
 class Follower:

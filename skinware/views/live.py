@@ -118,16 +118,18 @@ class LiveDriver:
 class EverySnapshot:
     """The snapshots of a driver between two that are shown, for what no picture may miss."""
 
-    def __init__(self, namespace: Namespace, name: str) -> None:
-        self._namespace, self._name = namespace, name
+    def __init__(self, name: str) -> None:
+        self._name = name
         self._reader: DriverReader | None = None
 
-    def until(self, newest: DriverSnapshot) -> list[DriverSnapshot]:
+    def until(self, newest: DriverSnapshot, namespace: Namespace) -> list[DriverSnapshot]:
         """Return those since the last call, ``newest`` last; only those that the ring still has, of one structure."""
+        if self._reader is not None and self._reader.namespace is not namespace:
+            self.close()
         found: deque[DriverSnapshot] = deque(maxlen=_MOST_BETWEEN)
         try:
             if self._reader is None:
-                self._reader = DriverReader(self._name, namespace=self._namespace, announce=False)
+                self._reader = DriverReader(self._name, namespace=namespace, announce=False)
             for snapshot in self._reader.in_order(timeout_s=0.0):
                 if snapshot.position >= newest.position:
                     break

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.views.following import Newest, ShownDriver
+from skinware.views.following import ShownDriver
 from skinware.views.history import DriverRest, Memory, WipeTest, threshold
-from skinware.views.quantities import HIGHEST, Levels, Quantity, levels_of, shear_of
+from skinware.views.quantities import HIGHEST, Levels, Newest, Quantity, levels_of, shear_of
 
 Mode = Literal["raw", "change", "peak", "wipe"]
 

@@ -58,7 +58,7 @@ class PlotBlock(NamedTuple):
     begins: bool = False
 
 
-class Rows:
+class PlotRows:
     """The values of lines in sample after sample, ``most`` at once; missing samples are a row without values."""
 
     def __init__(self, most: int | None = None) -> None:
@@ -92,7 +92,7 @@ class _Feed:
         self.reader: ServiceReader[Any] = reader(source.name, namespace=source.namespace, announce=False)
         self.of, self.number = source.of, 0
         self.lines: dict[int, Line] = {}
-        self.rows = Rows(_MOST_SAMPLES)
+        self.rows = PlotRows(_MOST_SAMPLES)
         self._values: Callable[[Any], Values] = lambda _: np.zeros(0)
 
     def choose(

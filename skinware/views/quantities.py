@@ -1,10 +1,11 @@
-"""Turn values into what is drawn: quantities, and their levels between two values."""
+"""Turn values into what is drawn: quantities, their levels between two values, and loads in the newest snapshots."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,10 +24,14 @@ from skinware.sensor_types import (
     TEMPERATURE,
     SensorType,
 )
+from skinware.state import settling
 from skinware.status import Status
 from skinware.structure import Structure
+from skinware.tactile.contacts_service import ContactsSample
+from skinware.tactile.motion import MotionSample
 from skinware.tactile.neighbours import pitch_m
 
+_Made = TypeVar("_Made")
 Levels = npt.NDArray[np.uint8]
 
 HIGHEST = 250
@@ -35,6 +40,7 @@ WITHOUT_VALUE = Status.NO_ACK | Status.MASKED | Status.NEVER_SEEN | Status.NOT_C
 """A sensor with one of these bits has no value that means anything."""
 _NO_TOUCH = {t.id for t in (TEMPERATURE, *ACCELERATION, *ANGULAR_RATE)}
 _NORMAL = (FORCE_Z.id, PRESSURE.id)
+_NEVER_SEEN, _ALL_BITS = np.uint8(Status.NEVER_SEEN), np.uint8(0xFF)
 _LONGEST = 127
 _STEEPEST = float(np.finfo(np.float32).max)
 
@@ -235,3 +241,92 @@ def shear_of(vectors: npt.NDArray[np.floating[Any]], longest: float) -> npt.NDAr
     scaled = np.nan_to_num(vectors * np.float32(_LONGEST / longest if longest > 0 else 0.0), posinf=0.0, neginf=0.0)
     parts: npt.NDArray[np.int8] = np.clip(np.rint(scaled), -_LONGEST, _LONGEST).astype(np.int8)
     return parts
+
+
+@dataclass(eq=False)
+class Newest:
+    """The newest snapshot of a driver, and what is known about it now.
+
+    Attributes:
+        status: (n_sensors,) uint8, status of its sensors now, with the health that the calmed driver publishes.
+        calm: snapshot of the calmed driver, if it lives and has the same sensors.
+        all: snapshots since the last one that was newest, of the calmed driver where there is one; the newest last.
+        contacts, motion: on the driver; None where no service publishes them.
+        shared: results that several viewers need, by a key of their own.
+    """
+
+    frame: DriverSnapshot
+    status: npt.NDArray[np.uint8]
+    calm: DriverSnapshot | None
+    contacts: ContactsSample | None
+    motion: MotionSample | None
+    all: Sequence[DriverSnapshot]
+    shared: dict[object, Any] = field(default_factory=dict)
+
+    def once(self, key: object, make: Callable[[], _Made]) -> _Made:
+        if key not in self.shared:
+            self.shared[key] = make()
+        made: _Made = self.shared[key]
+        return made
+
+    def physical(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]]:
+        """Return (n,) values of a quantity's sensors in its unit."""
+        return self.once(("physical", quantity.name), lambda: self.frame.physical(quantity.type.name))
+
+    def all_physical(self) -> npt.NDArray[np.float32]:
+        """Return (n_sensors,) float32, values of the sensors of all types, each in its unit."""
+        return self.once("all", lambda: physical_values(self.frame))
+
+    def above_baseline(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]] | None:
+        """Return (n,) how far values are above their baselines, 0 without touch; None without a calmed driver."""
+        calm = self.calm
+        if calm is None:
+            return None
+        return self.once(("calm", quantity.name), lambda: calm.physical(quantity.type.name))
+
+    @property
+    def contacts_position(self) -> tuple[int, int] | None:
+        return None if self.contacts is None else self.contacts.position
+
+    @property
+    def why(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8: a :class:`skinware.status.Why` for each, of the calmed driver."""
+        return (self.calm or self.frame).why
+
+    @property
+    def settling(self) -> npt.NDArray[np.bool_]:
+        """(n_sensors,) bool: those whose baselines the calmed driver does not know yet."""
+        return self.once("settling", lambda: settling(self.calm or self.frame))
+
+    @property
+    def marked(self) -> npt.NDArray[np.uint8]:
+        """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
+        return self.once(
+            "marked", lambda: np.where(self.settling & ((self.status & _NEVER_SEEN) != 0), _ALL_BITS, self.status)
+        )
+
+    def highest_change(self, quantity: Quantity, rest: npt.NDArray[np.float32]) -> npt.NDArray[np.floating[Any]]:
+        """Return (n,) the greatest distance of fresh values from ``rest``, or above baselines, in all snapshots."""
+        changes = np.stack([frame.physical(quantity.type.name) for frame in self.all])
+        if self.calm is None:
+            changes -= rest[quantity.where]
+        fresh = np.stack([frame.status[quantity.where] for frame in self.all]) == 0
+        highest: npt.NDArray[np.floating[Any]] = np.where(fresh, np.nan_to_num(np.abs(changes)), 0).max(axis=0)
+        return highest
+
+    def totals(self, quantity: Quantity, rest: npt.NDArray[np.float32] | None) -> npt.NDArray[np.float64] | None:
+        """Return (k, n_pads) the load on each pad in each of ``all``, the sum or the highest of its values.
+
+        Args:
+            rest: (n_sensors,) values at rest that are taken off; None: none are.
+
+        Returns:
+            None where values are no loads: counts, but on a hand or beside a calmed driver, and other quantities.
+        """
+        if self.calm is None and not quantity.has_loads:
+            return None
+        loads = np.stack([frame.physical(quantity.type.name) for frame in self.all])
+        if self.calm is None and rest is not None:
+            loads -= rest[quantity.where]
+        without = np.stack([frame.status[quantity.where] for frame in self.all]) & WITHOUT_VALUE
+        return quantity.totals(np.where(without == 0, np.nan_to_num(loads), 0))

@@ -12,7 +12,7 @@ from skinware.realtime import NS_PER_S
 from skinware.structure import Structure
 from skinware.views.following import Follower, ShownDriver
 from skinware.views.looks import Line
-from skinware.views.plots import PlotBlock, Rows, Values, values_of
+from skinware.views.plots import PlotBlock, PlotRows, Values, values_of
 
 if TYPE_CHECKING:
     from skinware.recording import Recording
@@ -110,14 +110,14 @@ class RecordedPlots:
             if not drivers:
                 continue
             values = values_of(part.of, list(part.lines.values()), drivers[0], self._follower.functions)
-            rows = Rows()
+            rows = PlotRows()
             try:
                 self._read_rows(part, _only(drivers[0].structure, values) if part.of != "contacts" else values, rows)
             except (SkinwareError, OSError):  # the replay reports it
                 continue
             self._blocks.append(rows.block(number, part.of, list(part.lines), begins=part.begins))
 
-    def _read_rows(self, part: _Part, values: Callable[[Any], Values | None], rows: Rows) -> None:
+    def _read_rows(self, part: _Part, values: Callable[[Any], Values | None], rows: PlotRows) -> None:
         title, (first_s, last_s) = part.played.title, part.stretch
         recording = self._recordings.get(title)
         if recording is None:

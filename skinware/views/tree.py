@@ -22,7 +22,8 @@ from skinware.state import (
 from skinware.status import Status, Why
 from skinware.structure import Structure
 from skinware.text import SETTLING, age_text, count_text, plural, words
-from skinware.views.following import Newest, ShownDriver
+from skinware.views.following import ShownDriver
+from skinware.views.quantities import Newest
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 _SEVERITIES = (ERROR, WARNING, NOTE)

@@ -16,10 +16,10 @@ import numpy.typing as npt
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.text import why_text
 from skinware.views import looks
-from skinware.views.following import Newest, ShownDriver
+from skinware.views.following import ShownDriver
 from skinware.views.live import places_of
 from skinware.views.plots import Plots
-from skinware.views.quantities import Quantity
+from skinware.views.quantities import Newest, Quantity
 from skinware.views.recorded_plots import RecordedPlots
 from skinware.views.scene import Scene
 from skinware.views.shows import Show

@@ -49,7 +49,7 @@ def _axes(name: str) -> list[str]:
     return [f"{name}_{axis}" for axis in "xyz"]
 
 
-class Block(NamedTuple):
+class PacketBlock(NamedTuple):
     """A kind of block.
 
     Attributes:
@@ -72,11 +72,11 @@ class Block(NamedTuple):
 
 
 _FRICTION = _own(10, ["friction"], "1")
-BLOCKS: Mapping[int, Block] = {
-    3: Block("pillars", 2, True, [*FORCE, *_own(1, _axes("displacement"), "m", 1e-3)]),
-    4: Block("total", 2, False, [*_own(4, _axes("total_force"), "N"), *_own(7, _axes("torque"), "N m", 1e-3)]),
-    5: Block("slip of pillars", 1, True, [*_own(11, ["slip_state"], "1"), *_FRICTION], states=1),
-    6: Block(
+BLOCKS: Mapping[int, PacketBlock] = {
+    3: PacketBlock("pillars", 2, True, [*FORCE, *_own(1, _axes("displacement"), "m", 1e-3)]),
+    4: PacketBlock("total", 2, False, [*_own(4, _axes("total_force"), "N"), *_own(7, _axes("torque"), "N m", 1e-3)]),
+    5: PacketBlock("slip of pillars", 1, True, [*_own(11, ["slip_state"], "1"), *_FRICTION], states=1),
+    6: PacketBlock(
         "slip", 1, False, [*_own(12, ["slip_detection"], "1"), *_FRICTION, *_own(13, ["grip_force"], "N")], states=1
     ),
 }
@@ -221,7 +221,7 @@ class _ShapeReading:
             raise ValueError
         return [self.number(width) for _ in range(count)]
 
-    def entries(self, block: Block, width: int) -> Iterator[list[int]]:
+    def entries(self, block: PacketBlock, width: int) -> Iterator[list[int]]:
         """Return the places of the values of each sensor: the states of all its pillars first."""
         for sensor in self.positions(width, _MOST_SENSORS):
             self.go(sensor)

@@ -19,7 +19,7 @@ from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NEVER_NS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NEVER_NS, Publisher, RequestDesk
 from skinware_drivers.testing.waiting import defect
 from tests.specification.decoding import SpecifiedDecoder
 from tests.specification.publishing import SpecifiedPublisher
@@ -57,7 +57,7 @@ class Publishing:
     has_desk: bool = True
 
 
-class Asking:
+class Asking(RequestDesk):
     """Those who wait for frames.
 
     Attributes:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from skinware.learning.features import Totals, contact_numbers, points, slip, spectrogram
 from skinware.learning.images import Colours, LiveImage, TouchImage
-from skinware.learning.live import ChosenSensors, LiveTouch, TouchOptions, TouchSample
+from skinware.learning.live import ChosenSensors, LiveTouch, TouchSample
 from skinware.learning.model_service import ModelService, onnx_model
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ __all__ = [
     "StreamedSamples",
     "Totals",
     "TouchImage",
-    "TouchOptions",
     "TouchSample",
     "contact_numbers",
     "onnx_model",

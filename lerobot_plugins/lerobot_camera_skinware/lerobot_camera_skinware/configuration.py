@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 from lerobot.cameras.configs import CameraConfig
 
-from skinware.learning import TouchOptions
+from skinware.learning.live import TouchOptions
 
 
 @CameraConfig.register_subclass("skinware")
 @dataclass(kw_only=True)
 class SkinwareCameraConfig(TouchOptions, CameraConfig):
-    """A camera that sees touch: options of :class:`skinware.learning.TouchOptions`, and these.
+    """A camera that sees touch: options of :class:`skinware.learning.live.TouchOptions`, and these.
 
     Attributes:
         fps, width, height: as of every camera.

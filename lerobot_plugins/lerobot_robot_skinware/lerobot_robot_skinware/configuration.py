@@ -9,13 +9,13 @@ import draccus
 from lerobot.cameras.configs import CameraConfig
 from lerobot.robots.config import RobotConfig
 
-from skinware.learning import TouchOptions
+from skinware.learning.live import TouchOptions
 
 
 @RobotConfig.register_subclass("skinware")
 @dataclass(kw_only=True)
 class SkinwareConfig(TouchOptions, RobotConfig):
-    """A robot and the skin on it: options of :class:`skinware.learning.TouchOptions`, and these.
+    """A robot and the skin on it: options of :class:`skinware.learning.live.TouchOptions`, and these.
 
     Attributes:
         robot: options of the robot that moves, its ``type`` among them: ``{type: so101_follower, port: /dev/ttyACM0}``.

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from skinware.tactile import Baseline
 from skinware.tactile.arrays import Doubles
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.onsets import EventKind, Events
+from skinware.tactile.testing import Response, World
+from skinware.tactile.testing import triangles as strip
 from tests.tactile.skins import placed, triangles
 
 FLAT = placed(triangles(10, 12))
@@ -95,3 +98,25 @@ def test_contacts_without_places_do_not_slip() -> None:
     for frame in range(40):
         value = np.roll(np.array([200.0, 100, 0, 0]), frame // 5)
         assert not contacts.update(value, value > 5, frame * 10_000_000, sigmas=value).slips.any()
+
+
+@pytest.mark.parametrize("strokes", [True, False])
+def test_strokes_of_a_drifting_skin_slip_and_pushes_do_not(strokes: bool) -> None:
+    slow = Response(creep=0.1, remainder=0.1, sag=0.05)
+    world = World(strip(modules=6), seed=4, noise=0.8, drift_per_min=5, walk=1.0, gain_spread=0.1, response=slow)
+    places, n = world.surface.geometry("strip"), len(world.surface)
+    for number in range(4):
+        at, begin_s = places.position_m[11 + 7 * number], 8 + 2.0 * number
+        if strokes:
+            world.stroke(np.array([at, np.add(at, (0.03, 0, 0))]), 40, begin_s, begin_s + 1)
+        else:
+            world.push(at, 40, begin_s, begin_s + 1)
+    baseline, contacts = Baseline(world.surface.module, world.surface.patch), Contacts(n, neighbours(places), places)
+    slipped = set()
+    for sample in world.samples(until_s=16):
+        values = sample.values.astype("f4")
+        calm = baseline.update(sample.time_ns, values, sample.usable)
+        sigmas = (values - calm.baseline) / calm.noise
+        found = contacts.update(calm.value, calm.touched, sample.time_ns, sigmas=sigmas)
+        slipped |= {contact.id for contact in found if contact.slips}
+    assert len(slipped) == (4 if strokes else 0)

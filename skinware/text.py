@@ -18,6 +18,8 @@ SETTLING = "settling"
 """Shown instead of that where sensors wait for their baselines."""
 
 _BETWEEN = "  "
+_WITH_PREFIX = ("Pa", "T", "m")
+_PREFIXES = ((1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"))
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -69,6 +71,23 @@ def count_text(count: int | None) -> str:
 def figure_text(value: float, digits: int = 4) -> str:
     """Return a measured value with this many digits, large ones whole: ``0.012``, ``150``, ``20,000``."""
     return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
+
+
+def prefixed(unit: str, greatest: float) -> tuple[float, str]:
+    """Return by what to divide values for people, and their unit then: ``1000.0, "kPa"``.
+
+    Pascals, teslas and metres get the prefix that fits the greatest value; other units stay as they are.
+    """
+    if unit not in _WITH_PREFIX or not greatest:
+        return 1.0, unit
+    factor, prefix = next((one for one in _PREFIXES if abs(greatest) >= one[0]), _PREFIXES[-1])
+    return factor, prefix + unit
+
+
+def measure_text(value: float, unit: str, digits: int = 4) -> str:
+    """Return a measured value with its unit: ``101.6 kPa``, ``0.012 N``, ``150 counts``."""
+    factor, unit = prefixed(unit, value)
+    return f"{figure_text(value / factor, digits)} {unit}".rstrip()
 
 
 def plural(count: int, what: str, several: str = "") -> str:

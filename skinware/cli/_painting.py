@@ -22,7 +22,7 @@ from textual.strip import Strip
 
 from skinware.cli import _heat_map as heat
 from skinware.cli._heat_map import BACKGROUND, LEVELS, Arrangement, Label
-from skinware.text import SETTLING, figure_text, printable, words
+from skinware.text import SETTLING, figure_text, prefixed, printable, words
 
 Colours = tuple[ColorTriplet, ...]
 _T = TypeVar("_T")
@@ -231,7 +231,8 @@ def _character(code: int, palette: Palette) -> str:
 
 def scale_text(values: Sequence[float], unit: str, palette: Palette) -> Text:
     """Return the colours from the lowest level to the highest, with values at both and perhaps in the middle."""
-    first, *others = map(figure_text, values)
+    factor, unit = prefixed(unit, max(map(abs, values)))
+    first, *others = (figure_text(value / factor) for value in values)
     text = Text(f"{first} ", no_wrap=True)
     half = LEVELS // len(others)
     for number, other in enumerate(others):

@@ -17,7 +17,7 @@ from skinware.skin_layout import SkinLayout
 from skinware.state import count_reasons, settling, status_now
 from skinware.structure import Structure
 from skinware.tactile.regions import Regions
-from skinware.text import figure_text, status_text, why_text
+from skinware.text import measure_text, status_text, why_text
 from skinware.views.history import Memory
 from skinware.views.quantities import physical_values, types_of
 
@@ -181,7 +181,7 @@ def describe_sensor(frame: DriverSnapshot, position: int) -> str:
     """Return a sensor in words: its name, value, status, position and uid."""
     structure, sensor_type = frame.structure, _type_of(frame.structure, position)
     raw = frame.values[position].item()
-    value = f"{figure_text(sensor_type.offset + sensor_type.scale * raw, 5)} {sensor_type.unit}".strip()
+    value = measure_text(sensor_type.offset + sensor_type.scale * raw, sensor_type.unit, 5)
     return (
         f"{structure.sensor_name(position)}: {sensor_type.name} {value} (raw {raw:g}),"
         f" {', '.join(filter(None, (status_text(int(frame.status[position])), why_text(int(frame.why[position])))))};"

@@ -158,17 +158,16 @@ async def _serve(
     port: int | None,
     ready: Callable[[int], None],
 ) -> None:
-    from skinware.views.programs import DoctorProgram, RecordingProgram
+    from skinware.views.programs import RECORD, DoctorProgram, RecordingProgram
     from skinware.views.server import ViewServer
 
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    program = (sys.executable, "-m", "skinware.cli.record", "--until-eof")
     origin = follower.origins[0]
     namespace = origin.namespace.name
     doctor = DoctorProgram((sys.executable, "-m", "skinware_drivers.cli.doctor"), namespace)
-    recording = RecordingProgram(program, namespace, origin.names)
+    recording = RecordingProgram(RECORD, namespace, origin.names)
     server = ViewServer(follower, access, recording, doctor=doctor, files=files, tls=tls)
     try:
         await server.show(host, DEFAULT_PORT if port is None else port, ready, stop)

@@ -12,7 +12,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json, say
-from skinware.text import count_text, figure_text, plural, status_text
+from skinware.text import count_text, measure_text, plural, status_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,7 +88,7 @@ class _Wipe:
             self._test.follow(*resting)  # the first press may be there before the next snapshot
         needed = threshold(self._rest.noise(self._type.name))
         what = {"driver": self._reader.name, "type": self._type.name, "unit": self._type.unit}
-        more = f"more than {figure_text(needed, 3)} {self._type.unit}".rstrip()
+        more = f"more than {measure_text(needed, self._type.unit, 3)}"
         tested = self._count()[0]
         ready = {"event": "ready", **what, "threshold": needed, "sensors": tested}
         sensors = plural(tested, f"{self._type.name} sensor")

@@ -23,6 +23,8 @@ _START_S = 10.0
 class View:
     """A page that this process serves to its own account, until ``close`` or its end. In a notebook it shows itself.
 
+    Its recordings are in the folder in which this process runs.
+
     Args:
         names: of drivers, or files of recordings (``.mcap``); none: all drivers.
         namespace: of the drivers; default: the one of ``SKINWARE_NAMESPACE``.
@@ -79,13 +81,16 @@ class View:
         return f'<iframe src="{escape(self.url)}" title="skin-view" style="{style}"></iframe>'
 
     def _run(self) -> None:
+        from skinware.views.programs import RECORD, RecordingProgram
         from skinware.views.server import ViewServer
 
         def ready(port: int) -> None:
             self._port = port
             self._is_ready.set()
 
-        server = ViewServer(self._follower, Access("127.0.0.1"), files=self._files, is_framed=True)
+        (origin,) = self._follower.origins
+        recording = RecordingProgram(RECORD, origin.namespace.name, origin.names)
+        server = ViewServer(self._follower, Access("127.0.0.1"), recording, files=self._files, is_framed=True)
         try:
             self._loop.run_until_complete(server.show("127.0.0.1", 0, ready, self._stop))
         except OSError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import sys
 import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from skinware.service.messages import OPERATIONS
 from skinware.state import DEAD
 from skinware.views.following import ShownDriver
 
+RECORD = (sys.executable, "-m", "skinware.cli.record", "--until-eof")
 _AGAIN_NS, _SOON_NS = 30 * NS_PER_S, 5 * NS_PER_S
 """Between two examinations while problems stay as they are, and when they change."""
 _END_S = 10.0

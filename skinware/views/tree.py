@@ -42,8 +42,12 @@ _STATUSES = {
     Status.NOT_CONNECTED: (NOTE, "not connected"),
     Status.MASKED: (NOTE, "switched off"),
 }
+_COVERED = (
+    "below their baselines, which were measured under a touch or a cover: free the skin there, and they are right a"
+    " second later; until then, touches there seem weaker"
+)
 _REASONS = {
-    Why.COVERED: (NOTE, "below their baselines: covered, or touched when these were measured"),
+    Why.COVERED: (NOTE, _COVERED),
     Why.DOUBTED: (WARNING, "fall and return where nothing touches: their polarity may be wrong"),
     Why.SATURATED: (NOTE, "at the end of their range: they may bear more"),
     Why.NO_RESOLUTION: (WARNING, "too coarse to show how strong a touch is"),

@@ -15,7 +15,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import RequestError, RequestRefused, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware.text import figure_text, plural, words
+from skinware.text import figure_text, measure_text, plural, words
 from skinware.views.live import after, frames_until
 from skinware_drivers.proving.proof import Proof, Verdict
 from skinware_drivers.proving.strokes import Matrix, judge
@@ -155,7 +155,7 @@ class _Walk:
             self._proof.add("tare", "", Verdict.SKIPPED, "not wanted")
         else:
             left = float(np.abs(values[-1][self._usable]).max()) if values and self._usable.any() else np.nan
-            seen = f"at most {figure_text(left, 3)} {self._type.unit} is left"
+            seen = f"at most {measure_text(left, self._type.unit, 3)} is left"
             self._proof.add("tare", "", left <= self._threshold, seen)
 
     # -- at rest --------------------------------------------------------------------------------------------------
@@ -231,7 +231,7 @@ class _Walk:
                 signed = float(change[most])
                 break
         answered = held[-1]
-        where = f"{self._structure.sensor_names(self._type.name)[most]} by {figure_text(signed, 3)} {self._type.unit}"
+        where = f"{self._structure.sensor_names(self._type.name)[most]} by {measure_text(signed, self._type.unit, 3)}"
         self._proof.add("right module", name, answered == module, where)
         self._proof.add("sign", name, signed > 0, "grows" if signed > 0 else "goes down when it is pressed")
         self._check_range(name, values[taxels], frame)

@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Browser, Page, Route
 
 from skinware.state import GONE, OLD, badness
-from skinware.text import age_text, count_text, rate_text
+from skinware.text import age_text, count_text, measure_text, rate_text
 from tests.browser.browsing import PATIENCE_MS
 from tests.browser.fake_server import PAGE
 
@@ -277,7 +277,7 @@ def test_a_line_keeps_a_minute_in_bounded_memory(tell: Callable[..., Any]) -> No
       series.push(5, 5);
       return [series.times.length, series.values[0], series.values.at(-1), series.time_ns.length];
     })()"""
-    assert tell("series.js", script, 100, 1e9) == [61, 39, 99, 2048]  # a sample a second
+    assert tell("series.js", script, 100, 1e9) == [66, 34, 99, 2048]  # a sample a second, and some ahead
     assert tell("series.js", script, 300_000, 1e5) == [65_536, 300_000 - 65_536, 299_999, 131_072]
 
 
@@ -324,6 +324,11 @@ def test_ages_rates_and_counts_look_as_in_the_terminal(tell: Callable[..., Any])
     assert tell("format.js", "a[0].map(m.rate)", rates_hz) == [rate_text(rate_hz) for rate_hz in rates_hz]
     counts = [0, 999, 30_848, 1_234_567]
     assert tell("format.js", "a[0].map(m.count)", counts) == [count_text(count) for count in counts]
+    measures = [(101_600, "Pa"), (-999, "Pa"), (0, "Pa"), (2.5e-5, "T"), (0.0015, "m"), (0.002, "N"), (4000, "counts")]
+    assert tell("format.js", "a[0].map((one) => m.measure(...one))", measures) == [
+        measure_text(*one) for one in measures
+    ]
+    assert tell("format.js", "m.range(0, 150000, 'Pa')") == ["0", "150 kPa"]
 
 
 # -- tree.js -------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@ from __future__ import annotations
 import click
 import pytest
 
-from skinware.text import age_text, count_text, plural, rate_text, table, wrapped
+from skinware.text import age_text, count_text, measure_text, plural, prefixed, rate_text, table, wrapped
 
 
 @pytest.mark.parametrize(
@@ -31,6 +31,15 @@ def test_ages_have_units(age_ns: int | None, text: str) -> None:
 )
 def test_rates_have_units(rate_hz: float | None, text: str) -> None:
     assert rate_text(rate_hz) == text
+
+
+def test_values_have_the_unit_in_which_they_are_read() -> None:
+    assert measure_text(101_600, "Pa") == "101.6 kPa"
+    assert measure_text(-2.5e-5, "T") == "-25 uT"
+    assert measure_text(0.0015, "m", 2) == "1.5 mm"
+    assert measure_text(0.002, "N") == "0.002 N"
+    assert measure_text(3, "") == "3"
+    assert prefixed("Pa", 0) == (1, "Pa")
 
 
 def test_counts_and_plurals() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import skinware
+import skinware.recording
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.recording.rig import recording
@@ -64,6 +65,19 @@ def test_a_function_of_the_program_is_a_line() -> None:
         page.state = {}
         page.pull_until(lambda _: page.state)
         assert "broken: ZeroDivisionError: division by zero" in [one["text"] for one in page.state["problems"]]
+
+
+@pytest.mark.thorough
+def test_a_cell_records_into_the_folder_of_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with torso(), closing(skinware.view("torso")) as view, page_of(view.url) as page:
+        page.say("record", action="start")
+        page.pull_until(lambda _: (page.state.get("recording") or {}).get("bytes"))
+        page.say("record", action="stop")
+        page.pull_until(lambda _: page.state["recording"] is None)
+    (file,) = tmp_path.glob("*.mcap")
+    with skinware.recording.open(file) as opened:
+        assert opened.drivers == ("torso",)
 
 
 def test_a_recording_is_shown(tmp_path: Path) -> None:

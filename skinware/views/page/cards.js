@@ -1,7 +1,7 @@
 // Cards with everything about one taxel: the one under the pointer, and the pinned ones.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
-import { age, figure, measure } from "./format.js";
+import { age, figure, measure, range } from "./format.js";
 import { markOf, NO_ACK, statusText } from "./marks.js";
 import { pathOf, piecesOf, rangeOf } from "./curves.js";
 
@@ -77,7 +77,7 @@ class Card {
     const [low, high] = rangeOf(pieces) ?? [null, null];
     const yOf = (value) => (high === low ? HEIGHT / 2 : HEIGHT - MARGIN - ((value - low) / (high - low)) * (HEIGHT - 2 * MARGIN));
     this.line.setAttribute("d", pieces.map((piece) => pathOf(piece.map(([x, value]) => [x, yOf(value)]))).join(""));
-    const text = pieces.length ? `last ${SHOWN_S} s: ${figure(low)} to ${measure(high, this.probe.sheet.unit)}` : "";
+    const text = pieces.length ? `last ${SHOWN_S} s: ${range(low, high, this.probe.sheet.unit).join(" to ")}` : "";
     setText(this.span, text);
     this.svg.setAttribute("aria-label", text || "no values yet");
   }

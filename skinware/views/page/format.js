@@ -41,8 +41,25 @@ export function short(x) {
   return Math.abs(x) >= 100 ? x.toFixed(0) : String(Number(x.toPrecision(3)));
 }
 
+const PREFIXES = [[1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "u"]];
+
+/** By what to divide values for people, and their unit then: pascals, teslas and metres with the prefix that fits the greatest. */
+export function prefixed(unit, greatest) {
+  if (!["Pa", "T", "m"].includes(unit) || !greatest) return [1, unit];
+  const [factor, prefix] = PREFIXES.find(([one]) => Math.abs(greatest) >= one) ?? PREFIXES.at(-1);
+  return [factor, prefix + unit];
+}
+
 export function measure(x, unit) {
-  return isKnown(x) && unit ? `${figure(x)} ${unit}` : figure(x);
+  if (!isKnown(x) || !unit) return figure(x);
+  const [factor, own] = prefixed(unit, x);
+  return `${figure(x / factor)} ${own}`;
+}
+
+/** Two ends of a range, with their unit: ["0", "101.6 kPa"]. */
+export function range(low, high, unit) {
+  const [factor, own] = prefixed(unit, Math.max(Math.abs(low ?? 0), Math.abs(high ?? 0)));
+  return [figure(isKnown(low) ? low / factor : low), isKnown(high) && own ? `${figure(high / factor)} ${own}` : figure(high)];
 }
 
 /** A count: "30,848". */

@@ -1,7 +1,7 @@
 // Save a picture of the view for papers, and control a recording, which the server makes.
 
 import { h, setPressed, setText, stamp } from "./dom.js";
-import { bytes, clock, figure, measure } from "./format.js";
+import { bytes, clock, range } from "./format.js";
 import { scalesOf } from "./legend.js";
 import { ramp, TOP } from "./palette.js";
 import { saveFigure } from "./pens.js";
@@ -33,13 +33,14 @@ export function savePicture(kind, stage, overlay, theme, footer) {
 
 function drawScale(pen, { low, high, unit, names }, theme, y) {
   const colours = ramp(theme);
-  pen.text(MARGIN + 62, y + 14, figure(low), inkOf(theme), { anchor: "end" });
+  const [from, to] = range(low, high, unit);
+  pen.text(MARGIN + 62, y + 14, from, inkOf(theme), { anchor: "end" });
   for (let step = 0; step < BAR.steps; step++) {
     const level = Math.round((step / (BAR.steps - 1)) * TOP);
     const x = MARGIN + 70 + (step * BAR.width) / BAR.steps;
     pen.rect(x, y + 6, BAR.width / BAR.steps + 0.5, BAR.height, `rgb(${colours.slice(4 * level, 4 * level + 3).join(",")})`);
   }
-  pen.text(MARGIN + 78 + BAR.width, y + 14, `${measure(high, unit)}   ${names.join(", ")}`, inkOf(theme));
+  pen.text(MARGIN + 78 + BAR.width, y + 14, `${to}   ${names.join(", ")}`, inkOf(theme));
 }
 
 /** Show on its button how far a recording has come; null: none is made. */

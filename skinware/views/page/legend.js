@@ -1,7 +1,7 @@
 // The meaning of colours and marks: each scale in use with its ends, unit and drivers, and the marks in view with their counts.
 
 import { byId, h, setChildren, setHidden, setPressed, setText } from "./dom.js";
-import { count, figure, measure } from "./format.js";
+import { count, figure, prefixed, range } from "./format.js";
 import { DIMMED, FRESH, MARKS } from "./marks.js";
 import { gradient } from "./palette.js";
 import { CLEAR, inksOf, signOf } from "./signs.js";
@@ -19,8 +19,9 @@ export class Legend {
     this.high = byId("high");
     this.marks = byId("marks");
     this.scales = byId("scales");
+    this.factor = 1; // from the numbers that are shown to the unit of the values
     const both = () => {
-      const scale = [this.low.valueAsNumber, this.high.valueAsNumber];
+      const scale = [this.low, this.high].map(({ valueAsNumber }) => valueAsNumber * this.factor);
       if (scale.every(Number.isFinite) && scale[0] < scale[1]) choose(scale);
     };
     this.low.addEventListener("change", both);
@@ -63,19 +64,22 @@ export class Legend {
   #setCommon(scales, fixed) {
     const [{ low, high, unit }] = scales;
     const ends = fixed ?? (scales.length < 2 ? [low, high] : null);
+    const isTyped = [this.low, this.high].includes(document.activeElement);
+    const [factor, own] = isTyped ? [this.factor, byId("unit").textContent] : prefixed(unit, Math.max(...(ends ?? [0]).map(Math.abs)));
+    this.factor = factor;
     for (const [input, end] of [[this.low, ends?.[0]], [this.high, ends?.[1]]]) {
-      if (document.activeElement !== input) input.value = ends ? figure(end) : "";
+      if (document.activeElement !== input) input.value = ends ? figure(end / factor) : "";
     }
-    const words = ends ? `colours from ${ends.map(figure).join(" to ")} ${unit}` : "colours, see the scales of the drivers";
+    const words = ends ? `colours from ${range(...ends, unit).join(" to ")}` : "colours, see the scales of the drivers";
     byId("gradient").setAttribute("aria-label", words);
-    setText(byId("unit"), unit);
+    setText(byId("unit"), own);
     setPressed(byId("auto"), fixed === null);
   }
 
   #row({ low, high, unit, names }) {
     const bar = h("div", { class: "gradient", "aria-hidden": "true" });
     bar.style.background = gradient(this.theme);
-    const [from, to] = [figure(low), measure(high, unit)];
+    const [from, to] = range(low, high, unit);
     const who = names.join(", ");
     return h("div", { class: "scale", title: `${from} to ${to}: ${who}` }, h("span", {}, from), bar, h("span", {}, to), h("span", {}, who));
   }

@@ -1,7 +1,7 @@
 // One strip: lines of one unit over the same seconds, or the spectrum of one of them; drawn with either pen.
 
 import { piecesOf, rangeOf, ticksOf } from "./curves.js";
-import { clock, figure, measure } from "./format.js";
+import { clock, figure, measure, prefixed } from "./format.js";
 import { GROUND, INK } from "./palette.js";
 import { placeOf } from "./series.js";
 import { spectrumOf } from "./spectrum.js";
@@ -112,10 +112,11 @@ export const figureHeight = (height, labels) => height + LEGEND_LINE * (labels +
 /** Draw the ground, the axes and the unit. @returns {(value: number) => number} heights of values. */
 function axes(pen, { width, height, theme, unit }, plot, [low, high], along) {
   const yOf = (value) => plot.y + plot.height * (1 - (value - low) / (high - low));
+  const [factor, own] = prefixed(unit, Math.max(Math.abs(low), Math.abs(high)));
   pen.rect(0, 0, width, height, groundOf(theme));
   for (const value of ticksOf(low, high, plot.height / TICK_Y)) {
     pen.line([[plot.x, yOf(value)], [plot.x + plot.width, yOf(value)]], lineOf(theme), {});
-    pen.text(plot.x - 6, yOf(value) + 4, figure(value), softOf(theme), { anchor: "end" });
+    pen.text(plot.x - 6, yOf(value) + 4, figure(value / factor), softOf(theme), { anchor: "end" });
   }
   for (const [x, text] of along) {
     pen.line([[x, plot.y + plot.height], [x, plot.y + plot.height + 4]], softOf(theme), {});
@@ -123,7 +124,7 @@ function axes(pen, { width, height, theme, unit }, plot, [low, high], along) {
     pen.text(x, height - 4, text, softOf(theme), { anchor });
   }
   pen.line([[plot.x, plot.y], [plot.x, plot.y + plot.height], [plot.x + plot.width, plot.y + plot.height]], softOf(theme), {});
-  pen.text(plot.x - 6, 11, unit, softOf(theme), { anchor: "end" });
+  pen.text(plot.x - 6, 11, own, softOf(theme), { anchor: "end" });
   return yOf;
 }
 

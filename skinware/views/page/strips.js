@@ -182,7 +182,7 @@ class Strip {
     const what = this.#what(FIGURE, "light");
     if (kind === "csv") return save(new Blob([this.#table(what)], { type: "text/csv" }), `${name}.csv`);
     const shown = this.isSpectrum ? [this.chosen] : this.lines.map((_, k) => k);
-    const labels = shown.map((k) => ({ k, text: `${labelOf(this.lines[k], this.strips.lines)}, ${this.unit}` }));
+    const labels = shown.map((k) => ({ k, text: labelOf(this.lines[k], this.strips.lines) }));
     const size = { width: FIGURE.width, height: figureHeight(FIGURE.height, labels.length) };
     const footer = `${this.isSpectrum ? "Amplitudes. " : ""}${this.strips.footer(this.lines, what.to)}`;
     const clean = { ...what, cursor_ns: null, moment_ns: null, cursor_hz: null };

@@ -1,7 +1,7 @@
 // The lists of loads of hands, fingers and pads, and of contacts and regions that services publish.
 
 import { h, setChildren, setHidden, setText } from "./dom.js";
-import { short } from "./format.js";
+import { isKnown, prefixed, short } from "./format.js";
 
 const CONTACTS = ["No.", "kind", "load", "mm/s", "s"];
 const LOAD = CONTACTS.indexOf("load");
@@ -35,12 +35,12 @@ export class Touches {
     this.parts = parts.slice(0, MOST_PARTS);
     setHidden(this.loads, !parts.length);
     while (this.partRows.rows.length < this.parts.length) this.partRows.append(this.#row((at) => this.lines.part(this.parts[at])));
-    const part = inUnit(this.parts.map(({ sheet }) => sheet));
+    const part = inUnit(this.parts.map(({ sheet }) => sheet), this.parts.map(({ peak }) => peak));
     setText(this.partHead.cells[LOAD - 1], part.unit ? `load, ${part.unit}` : "load");
     fill(this.partRows, this.parts.map(({ name, total, peak, sheet: { unit } }) => [name, part.write(total, unit), part.write(peak, unit)]));
     this.parts.forEach(({ size }, row) => (this.partRows.rows[row].dataset.size = size));
     setHidden(this.contacts, this.contacts.hidden && !contacts.length); // once there were some, it stays
-    const load = inUnit(contacts);
+    const load = inUnit(contacts, contacts.map((contact) => contact.load));
     this.shown = contacts;
     while (this.contactRows.rows.length < contacts.length) this.contactRows.append(this.#row((at) => this.lines.contact(this.shown[at])));
     setText(this.contactHead.cells[LOAD], load.unit ? `load, ${load.unit}` : "load");
@@ -55,7 +55,7 @@ export class Touches {
       ]),
     );
     setHidden(this.regions, !regions.length);
-    const region = inUnit(regions);
+    const region = inUnit(regions, regions.map(({ value }) => value));
     setText(this.regionHead.cells[1], region.unit);
     fill(
       this.regionRows,
@@ -71,10 +71,12 @@ export class Touches {
 }
 
 /** The unit of all rows for the head of a column, and the text of a value; with several units, each value has its own. */
-function inUnit(rows) {
+function inUnit(rows, values) {
   const units = new Set(rows.map(({ unit }) => unit ?? ""));
-  if (units.size > 1) return { unit: "", write: (x, unit) => `${short(x)} ${unit ?? ""}`.trim() };
-  return { unit: [...units][0] ?? "", write: short };
+  const write = (x, [factor, unit]) => `${short(isKnown(x) ? x / factor : x)} ${unit}`.trim();
+  if (units.size > 1) return { unit: "", write: (x, unit) => write(x, prefixed(unit ?? "", x)) };
+  const [factor, unit] = prefixed([...units][0] ?? "", Math.max(0, ...values.map((x) => Math.abs(x ?? 0))));
+  return { unit, write: (x) => write(x, [factor, ""]) };
 }
 
 function fill(body, rows) {

@@ -106,7 +106,7 @@ def write_onnx(path: Path, window: int, taxels: int, *, with_positions: bool) ->
     inputs = [helper.make_tensor_value_info("values", TensorProto.FLOAT, [1, window, taxels])]
     outputs = [helper.make_tensor_value_info("mean", TensorProto.FLOAT, [1, taxels])]
     nodes = [helper.make_node("ReduceMean", ["values"], ["mean"], axes=[1], keepdims=0)]
-    newest = []
+    newest: list[TensorProto] = []
     if with_positions:
         newest = [numpy_helper.from_array(np.array(window - 1), "newest")]
         inputs.append(helper.make_tensor_value_info("positions", TensorProto.FLOAT, [1, taxels, 3]))

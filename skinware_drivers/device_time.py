@@ -70,16 +70,12 @@ class DeviceClock:
         self._stamp = -1
         self._received_ns = 0
         self._last_ns = -(1 << 63)
-        self._slope = 0.0
+        self.drift: float = 0.0
+        """How much slower the device's clock is than CLOCK_MONOTONIC, as a fraction; 0 until it is known."""
         self._offset_ns = 0.0
         self.restarts: int = 0
         self.stops: int = 0
         self.repeated: int = 0
-
-    @property
-    def drift(self) -> float:
-        """How much slower the device's clock is than CLOCK_MONOTONIC, as a fraction; 0 until it is known."""
-        return self._slope
 
     def convert(self, stamps: npt.ArrayLike, received_ns: npt.ArrayLike) -> Times:
         """Return when frames were stamped.
@@ -114,7 +110,7 @@ class DeviceClock:
         np.minimum(times_ns, received, out=times_ns)
         # the newest whole part shows that the clock stands still
         _, x, y = self._points[-2] if len(self._points) > 1 else (0, 0.0, -math.inf)
-        if y - self._slope * x - self._offset_ns > _FAR_BEHIND_NS:
+        if y - self.drift * x - self._offset_ns > _FAR_BEHIND_NS:
             self.stops += 1
             self._stamp = -1  # the next one restarts the clock
             times_ns = received.copy()
@@ -125,7 +121,7 @@ class DeviceClock:
         self._points.clear()
         self._origin_ns, self._received_ns, self._stamp = received_ns, received_ns, stamp
         self._ticks = 0
-        self._slope = self._offset_ns = 0.0
+        self.drift = self._offset_ns = 0.0
 
     def _restart(self, raw: Times, received: Times, step: Times, at: int) -> None:
         self.restarts += 1
@@ -150,11 +146,11 @@ class DeviceClock:
         return stop
 
     def _line(self, device_ns: Floats) -> Floats:
-        return self._offset_ns + self._slope * device_ns
+        return self._offset_ns + self.drift * device_ns
 
     def _learn(self, received: Times, device_ns: Floats, delay_ns: Floats) -> None:
         """Keep the points of least delay, and fit the line under them."""
-        above = delay_ns - self._slope * device_ns
+        above = delay_ns - self.drift * device_ns
         parts = received // self._part_ns
         edges = np.flatnonzero(np.diff(parts, prepend=parts[:1] - 1))
         for start, stop in zip(edges.tolist(), [*edges[1:].tolist(), len(parts)], strict=True):
@@ -163,11 +159,11 @@ class DeviceClock:
             if not self._points or self._points[-1][0] != point[0]:
                 self._points.append(point)
                 self._fit_slope()
-            elif above[best] < self._points[-1][2] - self._slope * self._points[-1][1]:
+            elif above[best] < self._points[-1][2] - self.drift * self._points[-1][1]:
                 self._points[-1] = point
         oldest = self._points[-1][0] - _WINDOW_PARTS
         recent = [point for point in list(self._points)[-_RECENT_PARTS:] if point[0] > oldest]
-        self._offset_ns = min(y - self._slope * x for _, x, y in recent)
+        self._offset_ns = min(y - self.drift * x for _, x, y in recent)
 
     def _fit_slope(self) -> None:
         whole = list(self._points)[:-1]  # the best point of the newest part may be yet to come
@@ -185,4 +181,4 @@ class DeviceClock:
         right = next(number for number, (x, _) in enumerate(hull) if x >= middle)
         (x0, y0), (x1, y1) = hull[right - 1], hull[right]
         slope = (y1 - y0) / (x1 - x0)
-        self._slope = min(max(slope, -_MOST_DRIFT), _MOST_DRIFT)
+        self.drift = min(max(slope, -_MOST_DRIFT), _MOST_DRIFT)

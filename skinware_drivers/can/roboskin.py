@@ -1,7 +1,7 @@
 """ROBOSKIN / iCub skin: MTB3 and MTB4 boards on CAN, sixteen modules of twelve channels each, and inertial sensors.
 
-``roboskin_layout`` has the frames, ``roboskin_setup`` the messages to the boards, their addresses and firmware, and
-``roboskin_options`` the options. Further sources: robotology/icub-main CanBusSkin.cpp; robotology/icub-firmware
+``roboskin_layout`` has the options and frames, ``roboskin_setup`` the messages to the boards, their addresses and
+firmware. Further sources: robotology/icub-main CanBusSkin.cpp; robotology/icub-firmware
 embot_app_application_theSkin.cpp.
 """
 
@@ -21,27 +21,25 @@ from skinware.status import Status
 from skinware_drivers import Link, Module, Patch, Watch, operation
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.roboskin_layout import (
+    FIRST_BOARD,
     HEAD_BYTE,
     INERTIAL,
+    LAST_BOARD,
+    NON_TACTILE,
     OLD_SKIN,
     SKIN,
     SKIN_TYPES,
     TAIL_BYTE,
+    TRIANGLES,
+    RoboskinOptions,
     board_of,
     inertial_patch,
     is_inertial,
     make_layout,
     make_types,
+    runs_text,
     skin_patch,
     triangle_module,
-)
-from skinware_drivers.can.roboskin_options import (
-    FIRST_BOARD,
-    LAST_BOARD,
-    NON_TACTILE,
-    TRIANGLES,
-    RoboskinOptions,
-    runs_text,
     usual_kind,
 )
 from skinware_drivers.can.roboskin_setup import (

@@ -17,8 +17,7 @@ from typing import Any
 
 from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware_drivers import Link, Match, Patch, operation
-from skinware_drivers.can.roboskin_layout import board_of
-from skinware_drivers.can.roboskin_options import (
+from skinware_drivers.can.roboskin_layout import (
     ERGO_HAND,
     FIRST_BOARD,
     LAST_BOARD,
@@ -27,6 +26,7 @@ from skinware_drivers.can.roboskin_options import (
     Kind,
     RoboskinOptions,
     SpecialBoards,
+    board_of,
     runs,
 )
 

@@ -22,7 +22,7 @@ import msgspec.structs
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, Triple
 from skinware.tactile.regions import Region
-from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
+from skinware_drivers.can.roboskin_layout import CHANNELS, NON_TACTILE, TRIANGLES, runs_text
 from skinware_drivers.icub.device import PortRange
 from skinware_drivers.icub.part import DevicePart
 from skinware_drivers.icub.xml_tree import Notes, read_bytes

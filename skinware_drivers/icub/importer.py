@@ -12,7 +12,7 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml
 from skinware.tactile.regions import Region, regions_to_toml
 from skinware.text import nearest_name
-from skinware_drivers.can.roboskin_options import CHANNELS
+from skinware_drivers.can.roboskin_layout import CHANNELS
 from skinware_drivers.icub.body import (
     Drawing,
     Positions,

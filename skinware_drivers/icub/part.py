@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from skinware_drivers.can.roboskin_options import FIRST_BOARD, LAST_BOARD, TRIANGLES
+from skinware_drivers.can.roboskin_layout import FIRST_BOARD, LAST_BOARD, TRIANGLES
 from skinware_drivers.icub.device import Group
 from skinware_drivers.icub.xml_tree import Element, Notes, words
 

@@ -14,7 +14,7 @@ import msgspec.structs
 from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import (
+from skinware_drivers.can.roboskin_layout import (
     CHANNELS,
     NON_TACTILE,
     TRIANGLES,

@@ -185,7 +185,7 @@ class BusLine:
         self.needs_care.set()
 
     def _is_away(self, error: Exception) -> None:
-        if self.connection.is_opening:
+        if self.connection.opening is not None:
             state, reason = BusState.CONNECTING, BusReason.FAILED
         elif isinstance(error, BusNotAvailable):
             state, reason = (BusState.DOWN if error.is_down else BusState.GONE), error.reason
@@ -282,7 +282,7 @@ class BusLine:
 
     async def stop(self) -> None:
         """Stop its devices, if they may send and the bus is open; raise ``DriverError`` if the driver's code fails."""
-        if not self.started or self.connection.is_opening or not self.connection.is_open:
+        if not self.started or self.connection.opening is not None or not self.connection.is_open:
             return
         try:
             async with asyncio.timeout(_STOP_TIMEOUT_S):

@@ -86,27 +86,22 @@ class Connection:
         self.lost: asyncio.Event = asyncio.Event()
         self.opened_ns: int = 0
         self._noted = ""
-        self._opening: SlowCall | None = None
+        self.opening: SlowCall | None = None
 
     @property
     def is_open(self) -> bool:
         """Whether the bus has a descriptor."""
         return self._bus.fileno() >= 0
 
-    @property
-    def is_opening(self) -> bool:
-        """Whether an attempt to open the bus has not returned yet."""
-        return self._opening is not None
-
     async def open(self) -> None:
         """Open the bus; raise whatever it raises, and ``BusNotAvailable`` if its interface hangs."""
         if self._bus.opens_slowly:
-            if self._opening is None:  # or the call of the last attempt has not returned yet
-                self._opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
-            if not await self._opening.is_over(_OPENING_S):
+            if self.opening is None:  # or the call of the last attempt has not returned yet
+                self.opening = SlowCall(f"bus {self._name}, opening", self._bus.open)
+            if not await self.opening.is_over(_OPENING_S):
                 why = f"bus {self._name} is not open after {_OPENING_S:g} s: its interface hangs"
                 raise BusNotAvailable(why, reason=BusReason.FAILED)
-            opening, self._opening = self._opening, None
+            opening, self.opening = self.opening, None
             opening.check()
         else:
             self._bus.open()
@@ -116,7 +111,7 @@ class Connection:
         """Let the pause before the next attempt to open the bus pass, or the first one after a loss."""
         if is_first:
             self._pauses.begin_again_after(now_ns() - self.opened_ns)
-        if self._opening is None:
+        if self.opening is None:
             await asyncio.sleep(self._pauses.next_s())
 
     def opened(self) -> None:
@@ -138,15 +133,15 @@ class Connection:
 
     async def close(self, patience_s: float) -> None:
         """Close the bus for good. If its interface hangs, stop waiting after this time, s."""
-        if self._opening is not None:
-            await self._opening.is_over(patience_s)
-        if not self._bus.opens_slowly or self._opening is not None:
+        if self.opening is not None:
+            await self.opening.is_over(patience_s)
+        if not self._bus.opens_slowly or self.opening is not None:
             self._close()
         elif not await SlowCall(f"bus {self._name}, closing", self._bus.close).is_over(patience_s):
             log.warning("bus %s: its interface hangs while it is closed, and is left to itself", self._name)
 
     def _close(self) -> None:
-        opening, self._opening = self._opening, None
+        opening, self.opening = self.opening, None
         if opening is None or not opening.leave(self._bus.close):
             self._bus.close()
         else:

@@ -82,9 +82,11 @@ class Generation:
     _known_state: npt.NDArray[np.uint8] = field(init=False)
     _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
     _look_ns: int = 0
+    tables: SkinTables = field(init=False)
     _doubles: Doubles = field(init=False)
 
     def __post_init__(self) -> None:
+        self.tables = self.decoder.tables
         self.batch = make_batch(self.lines, self.decoder.compiled.headroom)
         self.begun_ns = now_ns()
         self._known_state = self.publisher.patches.state.copy()
@@ -96,10 +98,6 @@ class Generation:
         for line in self.lines:
             if line.patches:
                 line.link.narrow(line.adapter.layout)
-
-    @property
-    def tables(self) -> SkinTables:
-        return self.decoder.tables
 
     def empty_batch(self) -> FrameBatch:
         """Return the batch, empty except for frames that wait for their partners."""

@@ -214,7 +214,11 @@ class BusChanges:
             for line in replaced.values():
                 await self._take_out(line)
             for line in new:
-                await self._put_in(line)
+                async with self._builder.built:
+                    line.begin_lost()
+                    self._lines[line.ordinal : line.ordinal + 1] = [line]
+                    self._builder.rebuild(forced=True)  # before anything of it arrives
+                self._serving.begin(line)
             for line in leaving:
                 await self._take_out(line)
                 await self._builder.build()
@@ -228,13 +232,6 @@ class BusChanges:
         free = {line.name: line.ordinal for line in self._lines if line.is_removed}
         behind_all = itertools.count(len(self._lines))
         return [free[name] if name in free else next(behind_all) for name in names]
-
-    async def _put_in(self, line: BusLine) -> None:
-        async with self._builder.built:
-            line.begin_lost()
-            self._lines[line.ordinal : line.ordinal + 1] = [line]
-            self._builder.rebuild(forced=True)  # before anything of it arrives
-        self._serving.begin(line)
 
     async def _take_out(self, line: BusLine) -> None:
         """Stop the devices of a bus, and close it. Its sensors stay in the structure until the next build."""

@@ -14,8 +14,7 @@ from msgspec import Meta
 from skinware.errors import BusError
 from skinware.sensor_types import SensorType
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_layout import SKIN_TYPES
-from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
+from skinware_drivers.can.roboskin_layout import SKIN_TYPES, Kind, RoboskinOptions
 from skinware_drivers.description import Patch
 from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link

@@ -25,7 +25,7 @@ from msgspec import Meta
 from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
-from skinware_drivers.can.roboskin_options import CHANNELS, NON_TACTILE, TRIANGLES
+from skinware_drivers.can.roboskin_layout import CHANNELS, NON_TACTILE, TRIANGLES
 from skinware_drivers.description import Module, Patch, Sensor
 from skinware_drivers.fields import Bits, DeviceTime, Identifier, Match, Sentinel
 from skinware_drivers.layout import Frame, Layout, Values

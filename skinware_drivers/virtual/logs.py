@@ -170,7 +170,8 @@ def _by_python_can(path: str, file: BinaryIO, begin: bytes) -> Iterator[tuple[st
                 f"{path}: no log of a CAN bus: candump -l, ASC, BLF, pcap and pcapng are read, recordings too"
             )
         for message in reader:
-            yield _name(message.channel), _item(message)
+            channel = message.channel
+            yield f"can{channel}" if isinstance(channel, int) else str(channel or "can0"), _item(message)
     except (ConfigurationError, GeneratorExit, OSError):
         raise
     except Exception as error:  # noqa: BLE001, readers of python-can raise whatever they meet
@@ -181,10 +182,6 @@ def _by_python_can(path: str, file: BinaryIO, begin: bytes) -> Iterator[tuple[st
     finally:
         if not file.closed:  # python-can closes a file that it has read
             text.detach()
-
-
-def _name(channel: object) -> str:
-    return f"can{channel}" if isinstance(channel, int) else str(channel or "can0")
 
 
 def _item(message: Any) -> WireItem:

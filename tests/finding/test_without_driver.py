@@ -11,7 +11,7 @@ import pytest
 from skinware.errors import BusError, BusSendError, ConfigurationError, HandshakeTimeout
 from skinware_drivers.can import roboskin, roboskin_setup
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.description import Patch
 from skinware_drivers.finding import without_driver
 from skinware_drivers.finding.without_driver import carry_out

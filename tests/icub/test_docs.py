@@ -9,7 +9,7 @@ import pytest
 
 from skinware import DriverReader
 from skinware.cli._command import exit_status
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.cli.import_ import command
 from skinware_drivers.testing.waiting import read_until
 from tests.commands import running

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
+from skinware_drivers.can.roboskin_layout import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.icub.importer import ImportedPart
 from tests.icub.conftest import DEFAULTS, WRAPPER, Made, board_sets, device, triangle_sets
 

@@ -7,7 +7,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import read_geometry
-from skinware_drivers.can.roboskin_options import Kind
+from skinware_drivers.can.roboskin_layout import Kind
 from skinware_drivers.icub.importer import ImportedPart
 from tests.icub.conftest import DEFAULTS, WRAPPER, Made, board_sets, device, triangle_sets
 

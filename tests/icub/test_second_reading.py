@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skinware.geometry import read_geometry
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BoardSetUp
 from skinware_drivers.icub.importer import ImportedPart, import_files
 from skinware_drivers.icub.xml_tree import Notes

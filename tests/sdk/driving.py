@@ -14,7 +14,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BusNotAvailable, BusSendError, StructureChanged
 from skinware.status import BusReason, Status
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.running.building import PublishMode
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import read_until

@@ -13,7 +13,7 @@ import pytest
 from skinware import BusReason, BusState, DriverReader, Namespace
 from skinware.errors import BusNotAvailable
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
 from skinware_drivers.testing.waiting import wait_until

@@ -11,7 +11,7 @@ from skinware import DriverReader
 from skinware.errors import RequestFailed, RequestRefused
 from skinware.geometry import Geometry
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.description import SkinTables, assemble
 from skinware_drivers.running.building import put_in_place
 from skinware_drivers.testing.driving import driving_lines

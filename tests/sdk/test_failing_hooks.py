@@ -13,7 +13,7 @@ from skinware import BusReason, BusState, DriverReader
 from skinware.errors import DriverError, PeerGone, RequestFailed
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import Patch, SkinTables
 from skinware_drivers.link import Link

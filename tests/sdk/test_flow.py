@@ -21,7 +21,7 @@ from skinware.errors import DriverError
 from skinware.status import DataPath
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
 from skinware_drivers.can.roboskin import BaselineWatch, RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.decoding.decoder import Updates
 from skinware_drivers.description import SkinTables

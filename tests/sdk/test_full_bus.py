@@ -9,7 +9,7 @@ import pytest
 
 from skinware import DriverReader
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BoardSetUp, warn_of_full_bus
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link

@@ -16,7 +16,7 @@ from skinware import BusReason, BusState, DriverReader
 from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import Event

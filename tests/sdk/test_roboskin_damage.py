@@ -6,7 +6,7 @@ import pytest
 
 from skinware import Status
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.can.roboskin_options import Kind
+from skinware_drivers.can.roboskin_layout import Kind
 from tests.sdk.test_roboskin_wire import MS, Rig, Wire, halves
 
 US = 1_000

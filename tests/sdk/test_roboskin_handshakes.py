@@ -9,7 +9,7 @@ import pytest
 
 from skinware import DriverReader, PatchState, Status
 from skinware_drivers.can import roboskin, roboskin_setup
-from skinware_drivers.can.roboskin_options import Kind
+from skinware_drivers.can.roboskin_layout import Kind
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus
 from skinware_drivers.virtual.hardware import Event

@@ -10,7 +10,7 @@ import pytest
 
 from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.errors import ConfigurationError
-from skinware_drivers.can.roboskin_options import RoboskinOptions, SpecialBoards
+from skinware_drivers.can.roboskin_layout import RoboskinOptions, SpecialBoards
 from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
 from tests.sdk.test_roboskin_wire import MS, Rig, halves

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skinware import Structure
-from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
+from skinware_drivers.can.roboskin_layout import Kind, RoboskinOptions
 from skinware_drivers.can.roboskin_setup import BoardSetUp, warn_of_uneven_triangles
 from tests.sdk.test_roboskin_wire import Rig
 

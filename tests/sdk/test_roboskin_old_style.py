@@ -8,7 +8,7 @@ import pytest
 
 from skinware import DriverReader, PatchState
 from skinware.errors import ConfigurationError, RequestFailed
-from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
+from skinware_drivers.can.roboskin_layout import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until

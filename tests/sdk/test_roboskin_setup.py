@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skinware import DriverReader, PatchState
 from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions, SpecialBoards
+from skinware_drivers.can.roboskin_layout import Kind, RoboskinOptions, SpecialBoards
 from skinware_drivers.can.roboskin_setup import BoardSetUp
 from skinware_drivers.virtual.hardware import Event
 from skinware_drivers.virtual.roboskin.boards import EmulatedBoard

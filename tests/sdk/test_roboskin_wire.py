@@ -14,7 +14,7 @@ from skinware import Status
 from skinware.errors import ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import Kind, RoboskinOptions
+from skinware_drivers.can.roboskin_layout import Kind, RoboskinOptions
 from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import assemble
 from tests.specification.decoding import SpecifiedDecoder

@@ -8,7 +8,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware.toml_text import Keys, line_of
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.cli.driver_file import ConfigFile
 
 TEXT = """\

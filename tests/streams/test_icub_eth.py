@@ -9,7 +9,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware.status import PatchState
-from skinware_drivers.can.roboskin_options import Kind
+from skinware_drivers.can.roboskin_layout import Kind
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.framing import Framed
 from skinware_drivers.streams.icub_eth import IcubEthOptions, rops

@@ -11,7 +11,7 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions as DriverOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions as DriverOptions
 from skinware_drivers.description import assemble
 from skinware_drivers.virtual.bus import PlacedCanBus, VirtualCanBus, virtual_bus
 from skinware_drivers.virtual.hardware import PlacedHardware, Pressing

@@ -23,7 +23,7 @@ import can
 from decode import SocketBus, sockets
 
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Patch

@@ -34,7 +34,7 @@ from skinware import DriverReader, DriverWriter, Namespace
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.receiving import rows_of
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.roboskin_options import RoboskinOptions
+from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.description import assemble
 from skinware_drivers.native import structs

@@ -295,6 +295,7 @@ class Touch:
     def __init__(self, seed: int, ordinal: int, skin: PressedSkin | None = None) -> None:
         random = np.random.default_rng([seed, ordinal])
         self._ordinal, self._skin = ordinal, skin
+        self.is_known_ahead = skin is None or skin.physics is None  # no physics decides the touch of coming moments
         self._rest = random.integers(0x8800, 0x9800, (TRIANGLES, CHANNELS))
         noise = random.normal(0, _NOISE_SCALE, (_NOISE_PERIOD, TRIANGLES, CHANNELS))
         self._noise = np.clip(np.rint(noise), -_NOISE_LIMIT, _NOISE_LIMIT).astype(np.int64)
@@ -312,11 +313,6 @@ class Touch:
     def version(self) -> int:
         """Changes when the touch from now on does, other than with time."""
         return 0 if self._skin is None else self._skin.version
-
-    @property
-    def is_known_ahead(self) -> bool:
-        """Whether the touch of coming moments is known: no physics decides it."""
-        return self._skin is None or self._skin.physics is None
 
     def capacitances(self, times_ns: ArrayI, cycles: ArrayI, cdc_offset: ArrayI, *, fingertip: bool) -> ArrayI:
         """Return (n, 16, 12) readings of the converters, 1-65534.

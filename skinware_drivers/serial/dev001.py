@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware.errors import BusError
+from skinware.errors import HandshakeTimeout
 from skinware.sensor_types import FORCE, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
@@ -83,7 +83,7 @@ class Dev001Driver(SerialAdapter[Dev001Options]):
         """Listen which sensors send, once all were started.
 
         Raises:
-            BusError: none does.
+            HandshakeTimeout: none does.
         """
         if not link.listen_only:
             self._is_started = False
@@ -130,14 +130,14 @@ class Dev001Driver(SerialAdapter[Dev001Options]):
         """Return the ports whose sensors send.
 
         Raises:
-            BusError: none does.
+            HandshakeTimeout: none does.
         """
         with link.follow(Match(0, 0)) as records:
             try:
                 async with asyncio.timeout(_FIRST_S):
                     ports = {(await records.get()).identifier}
             except TimeoutError:
-                raise BusError(
+                raise HandshakeTimeout(
                     f"{link.bus_name}: no sensor sends within {_FIRST_S:g} s: does the text command `info` of the board"
                     " find any, in the mode (I2C, SPI) that the board is in?"
                 ) from None

@@ -7,7 +7,7 @@ import struct
 import numpy as np
 import pytest
 
-from skinware.errors import BusError
+from skinware.errors import HandshakeTimeout
 from skinware.status import Status
 from skinware_drivers.serial.dev001 import Dev001Driver, Dev001Options
 from skinware_drivers.testing.comparison import until_fresh
@@ -90,7 +90,7 @@ def test_a_silent_board() -> None:
     async def scenario(clock: HandClock) -> None:
         case = type("Empty", (Conformance,), {"emulator_options": {"ports": ()}})()
         async with case.handshakes(clock) as rig:
-            with pytest.raises(BusError, match="no sensor sends"):
+            with pytest.raises(HandshakeTimeout, match="no sensor sends"):
                 await rig.adapter.describe(rig.link)
 
     play(scenario)

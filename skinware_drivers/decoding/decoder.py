@@ -119,10 +119,17 @@ class SkinState:
             self.all_status[:-1],
             self.all_group_time_ns[:-1],
         )
-        self.updated, self.touched = self.all_updated[:-1], self.all_touched[:-1]
         self.patch_time_ns = self.all_patch_time_ns[:-1]
         self.bus_counters: npt.NDArray[np.int64] = np.zeros((len(structure.buses), len(BUS_COUNTERS)), np.int64)
         self.patch_counters: npt.NDArray[np.int64] = np.zeros((structure.n_patches, len(PATCH_COUNTERS)), np.int64)
+
+    @property
+    def updated(self) -> npt.NDArray[np.bool_]:
+        return self.all_updated[:-1]
+
+    @property
+    def touched(self) -> npt.NDArray[np.bool_]:
+        return self.all_touched[:-1]
 
     @property
     def module_time_ns(self) -> npt.NDArray[np.int64]:

@@ -41,7 +41,7 @@ _AT_ONCE = 0
 _SHORTEST_SLEEP_NS = 4_000_000
 """Shortest time between two wake-ups, so that frames come together as from a USB interface."""
 _LONGEST_BACKLOG_NS = 1_000_000_000
-"""What waits longer is dropped, as from a full receive buffer."""
+"""Frames and bytes that wait longer are dropped, as from a full receive buffer."""
 
 
 class EmulatedBus(Bus):

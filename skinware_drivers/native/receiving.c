@@ -1,4 +1,4 @@
-/* Takes what has arrived on a CAN socket: can/socketcan.py, receiving.py and controller.py. */
+/* Takes what has arrived on a CAN socket: can/socketcan.py and receiving.py. */
 #include "flow.h"
 
 #include <errno.h>

@@ -101,7 +101,6 @@ struct module {
 
 struct baseline {
     int64_t n, n_patches, n_modules, n_runs;
-    int64_t n_near; /* columns of the table of neighbours */
     int64_t is_signed, is_held;
     int64_t has_no_common; /* what taxels had in common was taken off before */
     double resolution, least, most;
@@ -114,7 +113,6 @@ struct baseline {
     struct patch *patches;
     struct module *modules;
     int64_t *patch, *module;
-    int32_t *near; /* (n, n_near) */
 
     int64_t time_ns, has_time, few_levels, is_near, all_ready;
     double tick_s, refused_share;

@@ -8,17 +8,6 @@ static int is_busy(const struct baseline *b, int64_t patch) {
     return b->patches[patch].since_s <= b->settle_s;
 }
 
-static void mark_near(struct baseline *b, int64_t taxel, float settle_s) {
-    const int32_t *near = b->near + taxel * b->n_near;
-    int64_t k;
-    b->modules[b->module[taxel]].near = 1;
-    for (k = 0; k < b->n_near; k++)
-        if (near[k] >= 0)
-            b->settling_s[near[k]] = settle_s;
-    if (b->n_near)
-        b->settling_s[taxel] = settle_s;
-}
-
 /* Finds the taxels that are near a touch, or were in the last settle_s. */
 void hold_near(struct baseline *b, double passed_s) {
     const float settle_s = (float)fmax(b->settle_s, 1e-6);
@@ -42,10 +31,10 @@ void hold_near(struct baseline *b, double passed_s) {
             continue;
         p->since_s = 0;
         p->largest = fmax(p->largest, (double)b->smooth[i]);
-        mark_near(b, i, settle_s);
+        b->modules[b->module[i]].near = 1;
     }
     for (i = 0, b->is_near = 0; i < b->n; i++) {
-        if (!b->n_near && b->modules[b->module[i]].near > 0)
+        if (b->modules[b->module[i]].near > 0)
             b->settling_s[i] = settle_s;
         b->held[i] = b->settling_s[i] > 0;
         b->is_near |= b->held[i];

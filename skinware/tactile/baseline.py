@@ -164,7 +164,6 @@ class Baseline:
         signed: a touch may move a value to both sides.
         common: the taxels of a patch may drift together; False: what they have in common was taken off before.
         limits: least and largest value of the type; a taxel there is saturated.
-        neighbours: (n, k) int, the taxels near each, filled with -1: they are held with it, instead of its module.
 
     Attributes:
         type_name: the sensor type, where it was made for one.
@@ -180,22 +179,17 @@ class Baseline:
         signed: bool = False,
         common: bool = True,
         limits: tuple[float, float] = (-math.inf, math.inf),
-        neighbours: npt.NDArray[np.integer] | None = None,
     ) -> None:
         self.type_name: str = ""
         self._suspect: Flags | None = None
         self._n = n = len(np.asarray(patch))
         modules, patches = np.array(module, np.int64), np.array(patch, np.int64)
-        near = np.array(np.zeros((n, 0)) if neighbours is None else neighbours, np.int32, order="C")
         starts = np.flatnonzero(np.diff(patches, prepend=-1))
         runs = np.column_stack([starts, np.append(starts[1:], n), patches[starts]])
         n_patches, n_modules = (int(group.max(initial=-1)) + 1 for group in (patches, modules))
         room = {"scratch": 2 * n, "blocks": _BLOCKS * n, "list": n + max(n_patches, n_modules) + 1}
         self._words = words = _STRUCTS["Baseline"]()
-        words.n, words.n_patches, words.n_modules, words.n_runs, words.n_near = (
-            *(n, n_patches, n_modules),
-            *(len(runs), near.shape[1]),
-        )
+        words.n, words.n_patches, words.n_modules, words.n_runs = n, n_patches, n_modules, len(runs)
         words.resolution, words.is_signed, words.forget_after_s = resolution, signed, FORGET_AFTER_S
         words.has_no_common = not common
         words.least, words.most = limits
@@ -203,7 +197,6 @@ class Baseline:
             "runs": np.array(runs, np.int64, order="C"),
             "patch": patches,
             "module": modules,
-            "near": near,
             "patches": np.zeros((n_patches, ctypes.sizeof(_STRUCTS["Patch"]) // 8)),
             "modules": np.zeros((n_modules, ctypes.sizeof(_STRUCTS["Module"]) // 8)),
         }
@@ -213,17 +206,8 @@ class Baseline:
         _begin(self._at)
 
     @classmethod
-    def of(
-        cls,
-        structure: Structure,
-        type_name: str,
-        settings: BaselineSettings | None = None,
-        *,
-        neighbours: npt.NDArray[np.integer] | None = None,
-    ) -> Self:
+    def of(cls, structure: Structure, type_name: str, settings: BaselineSettings | None = None) -> Self:
         """Make one for the sensors of a type, in the order of ``structure.index(type_name)``.
-
-        Settings and neighbours are as for the constructor.
 
         Raises:
             StructureError: no such type here.
@@ -236,7 +220,6 @@ class Baseline:
             resolution=resolution_of(structure, type_name),
             signed=type_name.startswith(SIGNED_TYPES),
             limits=(sensor_type.minimum, sensor_type.maximum),
-            neighbours=neighbours,
         )
         baseline.type_name = type_name
         return baseline

@@ -324,14 +324,6 @@ def test_types_that_a_touch_moves_to_both_sides() -> None:
     assert not bench.run(1.5).touched.any()
 
 
-def test_neighbours_are_held_in_place_of_modules() -> None:
-    table = np.full((N, 2), -1, np.int32)
-    table[3] = (4, 20)
-    bench = Bench(neighbours=table)
-    bench.run(6)
-    assert np.flatnonzero(bench.run(0.5, on(3)).held).tolist() == [3, 4, 20]
-
-
 def test_the_same_frame_twice_changes_nothing() -> None:
     bench = Bench()
     bench.run(6)

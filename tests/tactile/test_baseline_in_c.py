@@ -62,12 +62,10 @@ def shuffled(seed: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
 def test_presses_losses_jumps_and_other_rates(seed: int) -> None:
     random = np.random.default_rng(seed)
     module, patch = shuffled(seed) if seed % 2 else (np.arange(N) // 12, np.arange(N) // 48)
-    near = random.integers(-1, N, (N, 3)).astype(np.int32) if seed % 3 == 2 else None
     resolution = 0.0 if seed == 4 else 1.0
     both = Both(
         *(module, patch),
         signed=seed == 3,
-        neighbours=near,
         resolution=resolution,
         limits=(0.0, 90.0) if seed != 4 else (-np.inf, np.inf),
         settings=BaselineSettings(calibrate_s=2.0, maximum_hold_s=6.0 if seed == 5 else None),

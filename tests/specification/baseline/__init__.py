@@ -102,7 +102,6 @@ class SpecifiedBaseline:
         resolution: the step of the values; 0 if they have none.
         signed: a touch may move a value to both sides.
         limits: least and largest value of the type; a taxel there is saturated.
-        neighbours: (n, k) int, the taxels near each, filled with -1: they are held with it, instead of its module.
 
     Attributes:
         type_name: the sensor type, where it was made for one.
@@ -117,7 +116,6 @@ class SpecifiedBaseline:
         resolution: float = 1.0,
         signed: bool = False,
         limits: tuple[float, float] = (-math.inf, math.inf),
-        neighbours: npt.NDArray[np.integer] | None = None,
     ) -> None:
         module, patch = np.asarray(module, np.intp), np.asarray(patch, np.intp)
         n = len(patch)
@@ -129,7 +127,7 @@ class SpecifiedBaseline:
         self._offsets = Offsets(patch)
         self._rest = Rest(self._offsets.patches)
         self._touches = Touches(module, patch, signed=signed)
-        self._surroundings = Surroundings(module, patch, neighbours)
+        self._surroundings = Surroundings(module, patch)
         self._falls = Falls(self._surroundings)
         self._all_held = False
         self._forced: Flags = np.zeros(n, bool)

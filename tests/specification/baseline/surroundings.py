@@ -20,7 +20,6 @@ class Surroundings:
     Args:
         module: (n,) int, the module of each taxel.
         patch: (n,) int, the patch of each taxel.
-        neighbours: (n, k) int, the taxels near each, filled with -1, in place of its module.
 
     Attributes:
         module, patch: as given.
@@ -31,8 +30,8 @@ class Surroundings:
         largest: (n_patches,) the largest load of each patch.
     """
 
-    def __init__(self, module: Rows, patch: Rows, neighbours: npt.NDArray[np.integer] | None) -> None:
-        self.module, self.patch, self._neighbours = module, patch, neighbours
+    def __init__(self, module: Rows, patch: Rows) -> None:
+        self.module, self.patch = module, patch
         self.n_modules = int(module.max(initial=-1)) + 1
         self.largest: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
         self.busy: Flags = np.zeros(len(module), bool)
@@ -60,15 +59,9 @@ class Surroundings:
         self.beside = self._settling_s >= np.float32(max(settle_s, 1e-6))
 
     def _near(self, active: Rows) -> Flags:
-        if self._neighbours is None:
-            touched_modules = np.zeros(self.n_modules, bool)
-            touched_modules[self.module[active]] = True
-            return touched_modules[self.module]
-        around = self._neighbours[active].ravel()
-        near = np.zeros(len(self.module), bool)
-        near[around[around >= 0]] = True
-        near[active] = True
-        return near
+        touched_modules = np.zeros(self.n_modules, bool)
+        touched_modules[self.module[active]] = True
+        return touched_modules[self.module]
 
     def forget(self, taxels: Flags) -> None:
         """Drop what is known of some taxels."""

@@ -103,11 +103,17 @@ def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "co
     warm = np.ptp(data.temperature_c[used]) >= _LEAST_WARMTH_K  # NaN: not known
     at_c = float(np.mean(data.temperature_c[used])) if warm else 25.0
     plays = [play * float(knots[-1]) for play in _PLAYS]
-    lived = [_lived(data.time_s, load, play, creep_s)[:, used] for play, creep_s in zip(plays, _CREEPS_S, strict=True)]
-    warmth = np.nan_to_num(data.temperature_c[used] - at_c) * bool(warm)
+    lags, slow = zip(
+        *(_lived(data.time_s, load, *one)[:, used] for one in zip(plays, _CREEPS_S, strict=True)), strict=True
+    )
+    load = load[used]
+    rising = [np.clip(load - low, 0, high - low) for low, high in itertools.pairwise(knots)]
+    by_warmth = load * np.nan_to_num(data.temperature_c[used] - at_c)[:, None] * bool(warm)
     problems = [
-        _Trial(data.force_n[used], load[used], knots, plays[i], lived[i][0], _CREEPS_S[k], lived[k][1], warmth)
-        for i, k in itertools.product(range(len(plays)), range(len(lived)))
+        _Trial(data.force_n[used], np.array([*rising, lag * (load > 0), late * (load > 0), by_warmth]), play, creep_s)
+        for (play, lag), (creep_s, late) in itertools.product(
+            zip(plays, lags, strict=True), zip(_CREEPS_S, slow, strict=True)
+        )
     ]
     ones = np.ones(len(pressed))
     best = min(problems, key=lambda problem: problem.cost(problem.weights(ones), ones))
@@ -115,7 +121,7 @@ def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "co
     presses = 1 + int((np.diff(data.time_s[used]) > _APART_S).sum())
     error, residual, held = _errors(best, presses)
     reach, y = float(data.force_n[used].max()), np.append(0, np.cumsum(weights[: len(knots) - 1] * np.diff(knots)))
-    lag, creep, by_warmth = weights[len(knots) - 1 :]
+    lag, creep, warmth = weights[len(knots) - 1 :]
     curve = Curve(
         type=type_name,
         from_unit=from_unit,
@@ -126,7 +132,7 @@ def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "co
         lag=float(lag),
         creep_s=best.creep_s,
         creep=float(creep),
-        temperature=float(by_warmth),
+        temperature=float(warmth),
         at_c=at_c,
         error=error,
         hysteresis=min(2 * best.play * abs(float(lag)) / float(y[-1]), 1.0) if y[-1] > 0 else None,
@@ -144,38 +150,28 @@ def _lived(time_s: Doubles, load: Doubles, play: float, creep_s: float) -> Doubl
     return lived
 
 
+@dataclass(frozen=True, eq=False)
 class _Trial:
-    """Linear features of the frames that count, for one play and one time constant."""
+    """Linear terms (terms, frames, taxels) of the frames that count, for one play and one time constant."""
 
-    def __init__(
-        self,
-        force_n: Doubles,
-        load: Doubles,
-        knots: Doubles,
-        play: float,
-        lag: Doubles,
-        creep_s: float,
-        slow: Doubles,
-        warmth: Doubles,
-    ) -> None:
-        self.play, self.creep_s, self.force_n = play, creep_s, force_n
-        self.every = np.ones(len(force_n), bool)
-        self.number = (load > 0).sum(axis=1)
-        pieces = [np.clip(load - low, 0, high - low) for low, high in itertools.pairwise(knots)]
-        self._rising = len(pieces)
-        touched = load > 0
-        self._terms = np.array([*pieces, lag * touched, slow * touched, load * warmth[:, None]])
-        """(terms, frames, taxels)."""
+    force_n: Doubles
+    terms: Doubles
+    play: float
+    creep_s: float
+
+    @property
+    def every(self) -> Flags:
+        return np.ones(len(self.force_n), bool)
 
     def weights(self, gain: Doubles, rows: Flags | None = None) -> Doubles:
         """The weights of the terms, those of the curve at least 0, by least squares."""
         rows = self.every if rows is None else rows
-        matrix = (self._terms[:, rows] @ gain).T
+        matrix = (self.terms[:, rows] @ gain).T
         free = np.linalg.norm(matrix, axis=0) > 0
         while True:
             found = np.zeros(len(free))
             found[free] = np.linalg.lstsq(matrix[:, free], self.force_n[rows], rcond=None)[0]
-            falling = (found < 0) & (np.arange(len(free)) < self._rising)
+            falling = (found < 0) & (np.arange(len(free)) < len(free) - 3)
             if not falling.any():
                 return found
             free &= ~falling
@@ -184,15 +180,15 @@ class _Trial:
         return float(((self.force_n - self.forces(weights, gain)) ** 2).sum())
 
     def forces(self, weights: Doubles, gain: Doubles) -> Doubles:
-        forces: Doubles = np.tensordot(weights, self._terms, 1) @ gain
+        forces: Doubles = np.tensordot(weights, self.terms, 1) @ gain
         return forces
 
     def solve(self, rows: Flags) -> tuple[Doubles, Doubles]:
         """Gains of the taxels, and weights, by turns."""
-        gain = np.ones(self._terms.shape[2])
+        gain = np.ones(self.terms.shape[2])
         weights = self.weights(gain, rows)
         for _ in range(_ROUNDS if len(gain) > 1 else 0):
-            each = np.tensordot(weights, self._terms[:, rows], 1)
+            each = np.tensordot(weights, self.terms[:, rows], 1)
             left = self.force_n[rows] - each @ gain
             ridge = float((left**2).mean()) / _GAIN_SPREAD**2 * np.eye(len(gain))
             gain = np.linalg.solve(each.T @ each + ridge, each.T @ self.force_n[rows] + ridge.sum(axis=1))
@@ -214,9 +210,10 @@ def _errors(problem: _Trial, presses: int) -> tuple[tuple[float, float], float, 
         gain, weights = problem.solve(~rows)
         expected[rows] = np.maximum(problem.forces(weights, gain)[rows], 0)
     left = np.abs(problem.force_n - expected)
-    terms = np.column_stack([problem.number, expected])
+    number = (problem.terms[0] > 0).sum(axis=1)
+    terms = np.column_stack([number, expected])
     slopes = np.maximum(np.linalg.lstsq(terms, left, rcond=None)[0], 0)
-    slopes[0] = max(slopes[0], _LEAST_SHARE * float(left.mean() / problem.number.mean()))
+    slopes[0] = max(slopes[0], _LEAST_SHARE * float(left.mean() / number.mean()))
     deviation = terms @ slopes
     level = min(0.95 + math.sqrt(0.05 * 0.95 / presses) / 2, 0.99)  # the fewer presses, the less sure is a quantile
     scale = float(np.quantile(left[::2] / deviation[::2], level)) / 1.96

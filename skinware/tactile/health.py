@@ -182,7 +182,7 @@ class HealthSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_f
     clipped: float = 0.5
     dead: float = 0.1
     weak: float = 0.25
-    dying: float = 0.45
+    dying: float = 0.5
     dropouts: float = 5.0
     crosstalk: float = 0.05
 

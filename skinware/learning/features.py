@@ -151,7 +151,7 @@ def slip(values: npt.NDArray[Any], rate_hz: float, quiet: npt.ArrayLike = 1.0) -
     """Return (n,) float32 in 0 to 1: how much of each value's change is vibration, as of something that slips.
 
     0: at rest, or pressed ever more; towards 1: it vibrates above 20 Hz more than it changes slowly. It is a feature
-    to learn from, not a detector: an impact vibrates as well.
+    to learn from: an impact vibrates as well. ``Contact.slips`` detects.
 
     Args:
         values: (samples, n), at least 0.1 s at 100 Hz or more, the oldest first.

@@ -567,3 +567,17 @@ def test_worlds_with_everything_that_goes_wrong_raise_nothing() -> None:
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
         assert np.isfinite(calm.value).all()
         assert np.isfinite(calm.baseline[calm.usable]).all()
+
+
+def test_a_light_load_beside_a_touch_is_not_learned_after_a_short_rest() -> None:
+    random, baseline, frames = np.random.default_rng(1), Baseline(np.zeros(16, int), np.zeros(16, int)), 0
+    strong, beside = {0: 2000, 1: 300}, {5: 2000, 1: 45}
+    for seconds, loads in ((8.0, {}), *((1.2, strong), (0.5, {}), (1.2, beside), (0.5, {})) * 3, (1.2, beside)):
+        for frame in range(round(seconds * 100)):
+            values = 1000 + np.rint(4 * random.standard_normal(16))
+            for taxel, load in {**strong, **beside, **loads}.items():
+                values[taxel] += load if taxel in loads else load * max(0.0, 1 - frame / 20) * (frames > 800)
+            frames += 1
+            calm = baseline.update(frames * 10_000_000, values)
+    assert abs(calm.baseline[1] - 1000) < 10
+    assert calm.touched[5]

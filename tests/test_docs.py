@@ -285,6 +285,7 @@ def test_every_driver_that_ships_is_on_the_list() -> None:
     listed = re.findall(r"^\|.*\| \[`(\w+)`\]", (ROOT / "docs/drivers.md").read_text(), re.MULTILINE)
     ours = [e.name for e in entry_points(group=DRIVERS) if e.value.startswith("skinware_drivers.")]
     assert sorted(listed) == sorted(ours)
+    assert f"All {len(ours)} are in [drivers]" in (ROOT / "README.md").read_text()
 
 
 def test_every_fault_of_the_reference_has_a_test() -> None:

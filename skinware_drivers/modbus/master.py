@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 from skinware.realtime import NS_PER_S
 from skinware_drivers.counters import BusCounters
+from skinware_drivers.fields import Reply
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Guests
-from skinware_drivers.modbus.registers import Image, Read, Row, Wanted
+from skinware_drivers.modbus.registers import Image, Read, Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.running.guard import Backoff, pauses_of_device
 
@@ -127,7 +128,7 @@ class Master:
         begun_ns: int,
         guests: Guests | None = None,
     ) -> None:
-        self.rows: deque[Row] = deque()
+        self.rows: deque[Reply] = deque()
         self._timing, self._counters, self._name = timing, counters, name
         self._guests = guests or Guests(may_write=False, over_tcp=over_tcp)
         self._image = Image(wanted)
@@ -232,7 +233,7 @@ class Master:
         elif asked.read == _GUEST:
             self._guests.answer(message.data, time_ns)
         elif asked.read == _COMMAND:
-            self.rows.append(Row(time_ns, ANSWERS | message.unit, message.data))
+            self.rows.append(Reply(time_ns, ANSWERS | message.unit, message.data))
         elif code := wire.exception_of(message.data):
             self._take_exception(asked, code, time_ns)
         else:
@@ -312,7 +313,7 @@ class Listener:
     """
 
     def __init__(self, wanted: Wanted, counters: BusCounters) -> None:
-        self.rows: deque[Row] = deque()
+        self.rows: deque[Reply] = deque()
         self._counters = counters
         self._image = Image(wanted)
         reads = wanted.reads()

@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.fields import AnyFlag, Packed
+from skinware_drivers.fields import AnyFlag, Packed, Reply
 from skinware_drivers.layout import Values
 from skinware_drivers.modbus.wire import MOST_REGISTERS, READ_HOLDING, READS, question_to_read
 
@@ -171,14 +171,6 @@ def _key(block: Registers) -> tuple[int, int, int]:
     return block.unit, block.function, block.every
 
 
-class Row(NamedTuple):
-    """A whole frame."""
-
-    time_ns: int
-    identifier: int
-    payload: bytes
-
-
 class Area:
     """Registers without a gap between them: their bytes as they came, and when.
 
@@ -216,7 +208,7 @@ class Image:
                     area.blocks.append((number, first, block))
                     break
 
-    def put(self, area: int, first: int, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
+    def put(self, area: int, first: int, data: bytes, time_ns: int, since_ns: int) -> list[Reply]:
         """Store registers of an area that were read; return the frames that are whole now.
 
         Registers that came before ``since_ns`` do not count.
@@ -232,13 +224,13 @@ class Image:
             oldest_ns = int(place.heard_ns[begin : begin + block.count].min())
             if oldest_ns > self.told_ns[number] and oldest_ns >= since_ns:
                 self.told_ns[number] = time_ns
-                rows.append(Row(oldest_ns, number, self._bytes(place.registers[begin : begin + block.count], block)))
+                rows.append(Reply(oldest_ns, number, self._bytes(place.registers[begin : begin + block.count], block)))
         return rows
 
-    def overhear(self, unit: int, question: bytes, data: bytes, time_ns: int, since_ns: int) -> list[Row]:
+    def overhear(self, unit: int, question: bytes, data: bytes, time_ns: int, since_ns: int) -> list[Reply]:
         """Store the wanted ones of the registers that another master has read; see :meth:`put`."""
         address, count = int.from_bytes(question[1:3], "big"), int.from_bytes(question[3:5], "big")
-        rows: list[Row] = []
+        rows: list[Reply] = []
         for number, area in enumerate(self.areas):
             where, step = area.where, self._wanted.step
             if (where.unit, where.function) != (unit, question[0]) or (address - where.address) % step:

@@ -7,7 +7,6 @@ import ctypes
 import logging
 import selectors
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -59,7 +58,6 @@ def make_watch(lines: Sequence[BusLine], tables: SkinTables) -> Watch:
     return watch
 
 
-@dataclass
 class Generation:
     """One structure in service.
 
@@ -67,30 +65,22 @@ class Generation:
         lines: the buses; the list may change, their places do not.
         period_s: nominal time between two updates, for the publisher.
         begun_ns: when it began, CLOCK_MONOTONIC ns.
-        flows: C reads the buses that it can read (see ``running.flow``).
+        flows: C reads the buses that it can read (see :class:`FlowSelector`).
     """
 
-    lines: Sequence[BusLine]
-    decoder: Decoder
-    watch: Watch
-    publisher: Publisher
-    period_s: float
-    batch: FrameBatch = field(init=False)
-    begun_ns: int = field(init=False)
-    path: NativePath = field(init=False)
-    flows: bool = False
-    _known_state: npt.NDArray[np.uint8] = field(init=False)
-    _known_losses: dict[int, tuple[int, ...]] = field(default_factory=dict)
-    _look_ns: int = 0
-    tables: SkinTables = field(init=False)
-    _doubles: Doubles = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.tables = self.decoder.tables
-        self.batch = make_batch(self.lines, self.decoder.compiled.headroom)
+    def __init__(
+        self, lines: Sequence[BusLine], decoder: Decoder, watch: Watch, publisher: Publisher, period_s: float
+    ) -> None:
+        self.lines, self.decoder, self.watch, self.publisher = lines, decoder, watch, publisher
+        self.period_s = period_s
+        self.tables = decoder.tables
+        self.batch = make_batch(lines, decoder.compiled.headroom)
         self.begun_ns = now_ns()
-        self._known_state = self.publisher.patches.state.copy()
-        self._doubles = Doubles(self.tables.structure, self.publisher.pace.period_ns)
+        self.flows: bool = False
+        self._known_state = publisher.patches.state.copy()
+        self._known_losses: dict[int, tuple[int, ...]] = {}
+        self._look_ns = 0
+        self._doubles = Doubles(self.tables.structure, publisher.pace.period_ns)
         self.publisher.buses.counters = [line.bus.counters for line in self.lines]
         self.decoder.samples = [line.bus.samples for line in self.lines]
         self.path = NativePath(self.decoder, self.publisher, self.batch)

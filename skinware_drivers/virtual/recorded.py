@@ -21,9 +21,10 @@ from skinware.wire import WireItem
 from skinware_drivers.bus import Bus, FrameBatch, chosen_by
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.counters import BusCounters, FramerCounters
+from skinware_drivers.fields import Reply
 from skinware_drivers.modbus.bus import ModbusBus
 from skinware_drivers.modbus.master import ANSWERS, Listener
-from skinware_drivers.modbus.registers import Row, Wanted
+from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.modbus.wire import Message, TcpMessages, is_question
 from skinware_drivers.options import options_from_strings
 from skinware_drivers.serial.bus import SerialBus
@@ -152,14 +153,14 @@ class Conversation(Listener):
         if reply is None:
             self._waiting.append(message)
         else:
-            self.rows.append(Row(time_ns, ANSWERS | message.unit, reply))
+            self.rows.append(Reply(time_ns, ANSWERS | message.unit, reply))
 
     def _pair(self, asked: Message, reply: Message, time_ns: int) -> None:
         key = asked.unit, asked.data
         self._replies[key] = reply.data
         if any((one.unit, one.data) == key for one in self._waiting):
             self._waiting = [one for one in self._waiting if (one.unit, one.data) != key]
-            self.rows.append(Row(time_ns, ANSWERS | asked.unit, reply.data))
+            self.rows.append(Reply(time_ns, ANSWERS | asked.unit, reply.data))
         super()._pair(asked, reply, time_ns)
 
 

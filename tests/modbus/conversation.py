@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from skinware_drivers.counters import BusCounters
+from skinware_drivers.fields import Reply
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Guests
 from skinware_drivers.modbus.master import Master, Timing
-from skinware_drivers.modbus.registers import Registers, Row, Wanted
+from skinware_drivers.modbus.registers import Registers, Wanted
 from skinware_drivers.modbus.wire import Message
 
 MS = 1_000_000
@@ -47,12 +48,12 @@ class Conversation:
             self.now = max(self.now, self.master.due_ns)
         raise AssertionError("it asks no more")
 
-    def answer(self, question: Message, data: bytes) -> list[Row]:
+    def answer(self, question: Message, data: bytes) -> list[Reply]:
         message = question._replace(data=data)
         self.hear(wire.tcp_frame(message) if self.over_tcp else wire.rtu_frame(message))
         return self.rows()
 
-    def registers(self, question: Message, first: int = 0) -> list[Row]:
+    def registers(self, question: Message, first: int = 0) -> list[Reply]:
         """The registers that it asks for: ascending numbers."""
         count = int.from_bytes(question.data[3:5], "big")
         return self.answer(question, reply_of(range(first, first + count)))
@@ -61,7 +62,7 @@ class Conversation:
         self.now += MS // 10
         self.master.heard(chunk, self.now)
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[Reply]:
         found = list(self.master.rows)
         self.master.rows.clear()
         return found

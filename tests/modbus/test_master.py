@@ -9,9 +9,10 @@ import pytest
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.counters import BusCounters
+from skinware_drivers.fields import Reply
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.master import ANSWERS, Listener, Talk
-from skinware_drivers.modbus.registers import Registers, Row, Wanted
+from skinware_drivers.modbus.registers import Registers, Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.virtual.recorded import Conversation as RecordedConversation
 from tests.modbus.conversation import (
@@ -334,7 +335,7 @@ def overhear(*blocks: Registers) -> tuple[Listener, BusCounters]:
     return Listener(Wanted(blocks), counters), counters
 
 
-def said(talk: Talk, data: bytes, time_ns: int = 1000 * MS) -> list[Row]:
+def said(talk: Talk, data: bytes, time_ns: int = 1000 * MS) -> list[Reply]:
     talk.heard(data, time_ns)
     rows = list(talk.rows)
     talk.rows.clear()

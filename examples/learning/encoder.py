@@ -19,7 +19,7 @@ import numpy.typing as npt
 from skinware.learning import ModelService, RecordedWindows, onnx_model
 
 TYPE, WINDOW, CODE, HIDDEN = "pressure", 8, 16, 128
-STEPS, BATCH = 1500, 128
+STEPS, BATCH = 2000, 256
 HELD_OUT = 0.2
 """Share of the windows, the last ones, that it does not learn from."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -222,7 +223,9 @@ class ShownDriver:
             status = status | (calm.status & _UNHEALTHY)
         origin, last = self.origin, calm or frame
         namespace = origin.namespace if calm is None or origin.calm is None else origin.calm
-        return Newest(frame, status, calm, contacts, motion, self._every.until(last, namespace) if is_newer else [last])
+        before = self.newest and (self.newest.calm or self.newest.frame).position
+        read_all = partial(self._every.until, last, namespace, before) if is_newer else lambda: [last]
+        return Newest(frame, status, calm, contacts, motion, read_all)
 
     def _fits(self, calm: Structure) -> bool:
         """Return whether a calmed driver has the same sensors."""

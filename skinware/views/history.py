@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,7 @@ class Memory:
         self.rest = rest or DriverRest(structure)
         self.wipe: WipeTest | None = None
         self.peak: tuple[str, Floats] | None = None
+        self.loads: deque[tuple[str, npt.NDArray[np.float64]]] = deque(maxlen=_FRAMES)
         self._greatest: dict[tuple[str, str], tuple[float, int]] = {}  # and when
         self._extremes: dict[tuple[str, str], tuple[float, float]] = {}
 

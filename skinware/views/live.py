@@ -122,8 +122,10 @@ class EverySnapshot:
         self._name = name
         self._reader: DriverReader | None = None
 
-    def until(self, newest: DriverSnapshot, namespace: Namespace) -> list[DriverSnapshot]:
-        """Return those since the last call, ``newest`` last; only those that the ring still has, of one structure."""
+    def until(
+        self, newest: DriverSnapshot, namespace: Namespace, after: tuple[int, int] | None
+    ) -> list[DriverSnapshot]:
+        """Return those after a position, ``newest`` last; only those that the ring still has, of one generation."""
         if self._reader is not None and self._reader.namespace is not namespace:
             self.close()
         found: deque[DriverSnapshot] = deque(maxlen=_MOST_BETWEEN)
@@ -133,7 +135,8 @@ class EverySnapshot:
             for snapshot in self._reader.in_order(timeout_s=0.0):
                 if snapshot.position >= newest.position:
                     break
-                found.append(snapshot)
+                if after is not None and snapshot.position > after:
+                    found.append(snapshot)
         except (ServiceTimeout, Overrun):
             pass
         except ServiceError:

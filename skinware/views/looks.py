@@ -179,6 +179,8 @@ class Look:
             if memory.wipe is None:
                 memory.wipe = WipeTest(driver.structure)
             memory.wipe.follow(values, fresh)
+        totals = None if self.mode == "wipe" else newest.totals(quantity, self._rest(memory))
+        memory.loads.extend((quantity.name, row) for row in (() if totals is None else totals))
 
     def quantity_of(self, driver: ShownDriver) -> Quantity | None:
         return driver.quantities[0] if self.quantity is None else driver.quantity(self.quantity)
@@ -198,9 +200,16 @@ class Look:
         if self.mode == "wipe":  # only sensors that moved further have the highest level, whatever rounding does
             levels[(levels == HIGHEST) & (values <= scale[1])] = HIGHEST - 1
         shear, longest = _shear(newest, quantity, memory)
-        rest = None if self.mode == "raw" else memory.rest.baseline
-        totals = None if self.mode == "wipe" else newest.totals(quantity, rest)
+        totals = None if self.mode == "wipe" else newest.totals(quantity, self._rest(memory))
+        if totals is not None:
+            loads = [row for name, row in memory.loads if name == quantity.name]
+            totals = np.array([*loads[:-1], totals[-1]])
+        memory.loads.clear()
         return QuantityPicture(quantity, levels, scale, shear, longest, totals)
+
+    def _rest(self, memory: Memory) -> npt.NDArray[np.float32] | None:
+        """Return (n_sensors,) the values that are taken off loads."""
+        return None if self.mode == "raw" else memory.rest.baseline
 
     def _memory_of(self, driver: ShownDriver) -> Memory:
         memory = self._memories.get(driver.number)

@@ -250,7 +250,7 @@ class Newest:
     Attributes:
         status: (n_sensors,) uint8, status of its sensors now, with the health that the calmed driver publishes.
         calm: snapshot of the calmed driver, if it lives and has the same sensors.
-        all: snapshots since the last one that was newest, of the calmed driver where there is one; the newest last.
+        read_all: returns ``all``.
         contacts, motion: on the driver; None where no service publishes them.
         shared: results that several viewers need, by a key of their own.
     """
@@ -260,7 +260,7 @@ class Newest:
     calm: DriverSnapshot | None
     contacts: ContactsSample | None
     motion: MotionSample | None
-    all: Sequence[DriverSnapshot]
+    read_all: Callable[[], Sequence[DriverSnapshot]]
     shared: dict[object, Any] = field(default_factory=dict)
 
     def once(self, key: object, make: Callable[[], _Made]) -> _Made:
@@ -304,6 +304,11 @@ class Newest:
         return self.once(
             "marked", lambda: np.where(self.settling & ((self.status & _NEVER_SEEN) != 0), _ALL_BITS, self.status)
         )
+
+    @property
+    def all(self) -> Sequence[DriverSnapshot]:
+        """Snapshots since the last one that was newest, of the calmed driver where there is one; the newest last."""
+        return self.once("all snapshots", self.read_all)
 
     def highest_change(self, quantity: Quantity, rest: npt.NDArray[np.float32]) -> npt.NDArray[np.floating[Any]]:
         """Return (n,) the greatest distance of fresh values from ``rest``, or above baselines, in all snapshots."""

@@ -7,6 +7,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import GenericAlias
 from typing import Any, TypeVar
 
 import msgspec
@@ -67,6 +68,15 @@ class TomlText:
         except msgspec.ValidationError as error:
             text, keys = wrong_value(error)
             raise ConfigurationError(f"{self.place(keys)}: {text}") from None
+
+    def entries(self, what: str, format_name: str, version: int, key: str, kind: Any) -> tuple[Any, ...]:
+        """Return all ``[[key]]`` of a file that has nothing else, each as ``kind``; otherwise as :meth:`of_format`."""
+        head = [("format", str), ("version", int)]
+        struct = msgspec.defstruct(
+            "_File", [*head, (key, GenericAlias(tuple, (kind, ...)), ())], forbid_unknown_fields=True
+        )
+        found: tuple[Any, ...] = getattr(self.of_format(what, format_name, version, struct), key)
+        return found
 
 
 def wrong_value(error: msgspec.ValidationError) -> tuple[str, Keys]:

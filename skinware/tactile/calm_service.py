@@ -113,7 +113,6 @@ class CalmService:
 
     Attributes:
         frames: number of frames that were taken.
-        restored: number of sensors that went on with what the file had.
         contacts, motion, health: the services beside it.
 
     Raises:
@@ -141,7 +140,6 @@ class CalmService:
         if self.namespace.name == self.into.name:
             raise ConfigurationError(f"{name!r} is in namespace {self.into.name!r} itself: give another with --into")
         self.frames = 0
-        self.restored = 0
         self.contacts = CalmContacts(contacts, name, self.into, group, poses)
         moving = (motion, regions) if regions is not None else ("", Regions(()))
         self.motion = CalmMotion(moving[0], name, self.into, group, moving[1], self.contacts)
@@ -196,6 +194,11 @@ class CalmService:
         self._stopping = True
 
     @property
+    def restored(self) -> int:
+        """Number of sensors that went on with what the file had."""
+        return self._learned.restored
+
+    @property
     def chain(self) -> Chain | None:
         """The chain for the present structure of the driver; None before it was seen."""
         return self._requests.chain
@@ -227,8 +230,7 @@ class CalmService:
         self._calmed.follow(chain.structure, self._source.reader, rate_hz)
         for derived in (self.contacts, self.motion, self.health):
             derived.follow(chain, rate_hz)
-        restored = self._learned.restore(chain, learned)
-        self.restored = restored if before is None else self.restored
+        self._learned.restore(chain, learned)
         self._requests.chain, self._state = chain, "waiting"
 
     def _publish(self, frame: DriverSnapshot) -> bool:

@@ -111,12 +111,6 @@ AnySettings = (
 )
 
 
-class _File(msgspec.Struct, forbid_unknown_fields=True):
-    format: str
-    version: int
-    stage: tuple[AnySettings, ...] = ()
-
-
 class ChainSettings:
     """The settings of the stages of a chain, in their order; ``place`` gives file and line of a stage, for messages."""
 
@@ -140,7 +134,7 @@ class ChainSettings:
         """
         path = Path(path)
         text = TomlText(path)
-        stages = text.of_format("chain", FORMAT, VERSION, _File).stage
+        stages: tuple[AnySettings, ...] = text.entries("chain", FORMAT, VERSION, "stage", AnySettings)
         if not stages:
             raise ConfigurationError(f"{path}: no [[stage]] in it")
         found = [
@@ -219,7 +213,7 @@ class ChainState:
 
 
 class Learning(Protocol):
-    """What learns of n taxels: baselines, stages, health."""
+    """Learns of n taxels: a baseline, a stage, health."""
 
     def state(self) -> Arrays: ...
     def restore(self, state: Arrays, rows: npt.NDArray[np.intp]) -> int | None: ...

@@ -62,10 +62,11 @@ def default_path(namespace: str, name: str) -> Path:
 
 
 class LearnedState:
-    """Keeps what one chain has learned in a file (None: in none)."""
+    """Keeps what one chain has learned in a file (None: in none); ``restored`` baselines began with that."""
 
     def __init__(self, path: Path | None) -> None:
         self._path = path
+        self.restored = 0
         self._saving: threading.Thread | None = None
         self._next_save_ns = now_ns() + _SAVE_EVERY_NS
 
@@ -74,15 +75,17 @@ class LearnedState:
 
         A state that does not fit is not used, and a line in the log says why.
         """
-        restored, why = 0, ""
+        found, why = state, ""
         if state is None and self._path is not None:
-            state, why = read_state(self._path)
+            found, why = read_state(self._path)
+        restored = 0
         try:
-            restored = 0 if state is None else chain.restore(state)
+            restored = 0 if found is None else chain.restore(found)
         except ConfigurationError as error:
             why = f"{self._path}: {error}"
         if why:
             log.warning("the learned state does not fit: %s", why)
+        self.restored = restored if state is None else self.restored
         return restored
 
     def keep(self, chain: Chain | None) -> None:

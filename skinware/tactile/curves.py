@@ -94,12 +94,6 @@ class Curve(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         return "\n[[curve]]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in lists.items())
 
 
-class _File(msgspec.Struct, forbid_unknown_fields=True):
-    format: str
-    version: int
-    curve: tuple[Curve, ...] = ()
-
-
 def curves_to_toml(curves: Sequence[Curve], comment: str = "") -> str:
     """Return the text of a file of curves, with a comment at its head."""
     head = "".join(f"# {line}\n" for line in comment.splitlines())
@@ -113,7 +107,7 @@ def read_curves(path: str | Path) -> tuple[Curve, ...]:
         ConfigurationError: not there, not TOML, not of this format, or a value that is wrong; the message says where.
     """
     text = TomlText(Path(path))
-    curves = text.of_format("file of curves", FORMAT, VERSION, _File).curve
+    curves: tuple[Curve, ...] = text.entries("file of curves", FORMAT, VERSION, "curve", Curve)
     seen: set[tuple[str, int | None]] = set()
     for number, curve in enumerate(curves):
         for uid in curve.uid if curve.uid is not None else (None,):

@@ -238,12 +238,6 @@ FORMAT, VERSION = "skinware-regions", 1
 _UIDS_IN_A_LINE = 8
 
 
-class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    format: str
-    version: int
-    region: tuple[Region, ...] = ()
-
-
 def read_regions(*paths: str | Path) -> Regions:
     """Read files of regions, which together are one set.
 
@@ -255,7 +249,7 @@ def read_regions(*paths: str | Path) -> Regions:
     places: list[str] = []
     for path in paths:
         text = TomlText(Path(path))
-        found = text.of_format("file of regions", FORMAT, VERSION, _File).region
+        found: tuple[Region, ...] = text.entries("file of regions", FORMAT, VERSION, "region", Region)
         places += [text.place(("region", number)) for number in range(len(found))]
         regions += found
     return Regions(regions, places)

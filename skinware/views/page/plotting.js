@@ -105,14 +105,18 @@ export class Plotting {
 
   /** Of a taxel. @param {object} probe */
   taxel(probe) {
-    const line = taxelLine(probe);
-    return { ...line, get label() { return probe.name; } };
+    const nameOf = () => this.#named(probe.sheet.driver, probe.name);
+    return { ...taxelLine(probe), get label() { return nameOf(); } };
   }
 
   /** Of a hand, finger, pad or board. */
   part({ sheet, name, modules }) {
-    const isOne = this.skin.drivers.size < 2 || name === sheet.driver.name;
-    return partLine({ sheet, name: isOne ? name : `${sheet.driver.name}, ${name}`, modules });
+    return partLine({ sheet, name: this.#named(sheet.driver, name), modules });
+  }
+
+  /** A name, with that of its driver where there are several. */
+  #named(driver, name) {
+    return this.skin.drivers.size < 2 || name === driver.name ? name : `${driver.name}, ${name}`;
   }
 
   contact(driver, contact) {

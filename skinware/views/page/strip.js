@@ -45,7 +45,7 @@ export function drawTimes(pen, what) {
   const span_s = (to - from) / 1e9;
   const most = plot.width / TICK_X;
   const seconds = what.isRecorded
-    ? ticksOf(Math.max(0, from / 1e9), to / 1e9, most).map((s) => [xOf(1e9 * s), clock(s)])
+    ? ticksOf(from / 1e9, to / 1e9, most).filter((s) => s >= 0).map((s) => [xOf(1e9 * s), clock(s)])
     : ticksOf(-span_s, 0, most).map((s) => [xOf(to + 1e9 * s), `${figure(s)} s`]);
   const yOf = axes(pen, what, plot, [low, high], seconds);
   pen.within(plot.x, plot.y, plot.width, plot.height, () => {
@@ -116,6 +116,7 @@ function axes(pen, { width, height, theme, unit }, plot, [low, high], along) {
   pen.rect(0, 0, width, height, groundOf(theme));
   for (const value of ticksOf(low, high, plot.height / TICK_Y)) {
     pen.line([[plot.x, yOf(value)], [plot.x + plot.width, yOf(value)]], lineOf(theme), {});
+    if (yOf(value) < plot.y + 6) continue; // the unit is there
     pen.text(plot.x - 6, yOf(value) + 4, figure(value / factor), softOf(theme), { anchor: "end" });
   }
   for (const [x, text] of along) {

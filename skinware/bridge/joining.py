@@ -88,7 +88,7 @@ class Joiner:
                     second_ns = max(second_ns + NS_PER_S, now_ns())
                     with self._mirror.lock:
                         self._mirror.tidy()
-                        self._publish_state({name: follower.report() for name, follower in self._followers.items()})
+                        self._publish_state(self._service_states())
                     each_second(self._state)
 
     def stop(self) -> None:
@@ -117,6 +117,9 @@ class Joiner:
         if self._peer.since_ns != self._state.since_ns:
             state = "live" if self.is_connected else "unheard"
             self._publish_state({name: replace(one, state=state) for name, one in self._state.services.items()})
+
+    def _service_states(self) -> dict[str, ServiceState]:
+        return {name: follower.report() for name, follower in self._followers.items()}
 
     def _publish_state(self, services: Mapping[str, ServiceState]) -> None:
         peer, clock = self._peer, self.clock

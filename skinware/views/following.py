@@ -223,7 +223,7 @@ class ShownDriver:
             status = status | (calm.status & _UNHEALTHY)
         origin, last = self.origin, calm or frame
         namespace = origin.namespace if calm is None or origin.calm is None else origin.calm
-        before = self.newest and (self.newest.calm or self.newest.frame).position
+        before = (self.newest.calm or self.newest.frame).position if self.newest is not None else None
         read_all = partial(self._every.until, last, namespace, before) if is_newer else lambda: [last]
         return Newest(frame, status, calm, contacts, motion, read_all)
 

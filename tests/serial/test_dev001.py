@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ def record(port: int) -> bytes:
     return struct.pack("<I", port) + BODY
 
 
-def found(stream: bytes, **options: object) -> list[tuple[int, bytes]]:
+def found(stream: bytes, **options: Any) -> list[tuple[int, bytes]]:
     framer = Dev001Driver(Dev001Options(**options)).framing.framer()
     frames = [frame for at in range(len(stream)) for frame in framer.feed(stream[at : at + 1])]
     counters = framer.counters

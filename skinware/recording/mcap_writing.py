@@ -159,10 +159,10 @@ class McapFile:
         self.counts: Counter[int] = Counter()
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
-        self._index = tempfile.SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent))  # noqa: SIM115
         self._chunks = 0
         self._start_ns, self._end_ns = (1 << 64) - 1, 0
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._index = tempfile.SpooledTemporaryFile(_SPOOL_BYTES, dir=str(path.parent))  # noqa: SIM115
         self._is_ours = True
         info = os.fstat(self._fd)
         self._inode = info.st_dev, info.st_ino
@@ -170,6 +170,7 @@ class McapFile:
         try:
             self._append([MAGIC, _bytes(Header(profile, f"skinware {version('skinware')}"))])
         except BaseException:
+            self._index.close()
             os.close(self._fd)
             path.unlink()
             raise

@@ -113,7 +113,9 @@ class CalmService:
 
     Attributes:
         frames: number of frames that were taken.
-        contacts, motion, health: the services beside it.
+        contacts: the service of its contacts.
+        motion: the service of the motion of regions.
+        health: the service of the health of its sensors.
 
     Raises:
         ConfigurationError: both namespaces are the same, or a bad name.

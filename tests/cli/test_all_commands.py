@@ -109,12 +109,6 @@ def test_calm_names_the_driver_that_may_be_meant(namespace: Namespace) -> None:
         )
 
 
-def test_a_file_where_record_expects_a_driver_is_answered_with_the_option() -> None:
-    done = refused("skin-record", "walk.mcap")
-    assert done.returncode == EXIT_USAGE
-    assert "give -o walk.mcap" in done.stderr
-
-
 def test_calmed_drivers_of_another_namespace_have_a_place_of_their_own() -> None:
     assert Namespace("default").calm_name == "calm"
     assert Namespace("lab").calm_name == "lab-calm"

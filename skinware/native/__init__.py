@@ -20,7 +20,7 @@ from skinware.errors import PlatformError
 
 __all__ = ["ABI", "Library", "core", "load"]
 
-ABI = 11
+ABI = 12
 """Number of the interface of ``library.c``: both change together."""
 
 _CORE = Path(__file__).with_name("libskinware.so")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import skinware.native
 
-ABI = 8
+ABI = 9
 """Number of the interface of ``path.c``; both change together."""
 
 _FILE = Path(__file__).with_name("libskinware_drivers.so")

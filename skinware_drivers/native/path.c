@@ -3,7 +3,7 @@
 
 #include <stdlib.h>
 
-enum { ABI = 8, FIRST_UPDATES = 64 };
+enum { ABI = 9, FIRST_UPDATES = 64 };
 
 SKINWARE_EXPORT uint32_t skinware_native_abi(void)
 {

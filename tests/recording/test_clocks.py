@@ -80,7 +80,7 @@ def _clocks_recorded(recorder: Recorder) -> int:
 
 
 @pytest.mark.parametrize("step_ns", [HOUR_NS, -HOUR_NS])
-def test_the_wall_clock_is_set(tmp_path: Path, namespace: Namespace, step_ns: int) -> None:
+def test_the_wall_clock_is_set(tmp_path: Path, calm_namespace: Namespace, step_ns: int) -> None:
     path = tmp_path / "walk.mcap"
     (news,) = with_a_step(path, step_ns)
     assert news["event"] == "clock_stepped"
@@ -100,7 +100,7 @@ def test_the_wall_clock_is_set(tmp_path: Path, namespace: Namespace, step_ns: in
     times = np.concatenate([block[TIME] for block in table.blocks([TIME])])
     assert (np.diff(times) > 0).all()
     assert times[-1] - times[0] < HOUR_NS // 2
-    with replaying(path, namespace=f"{namespace.name}-replay", speed=20.0) as replayer:
+    with replaying(path, namespace=calm_namespace, speed=20.0) as replayer:
         wait_until(lambda: replayer.frames["torso"] == 61)
 
 

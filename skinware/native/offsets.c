@@ -175,9 +175,8 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
         for (i = first; i < last; i++)
             a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1) & (a.bears[i] ^ 1);
         INDEPENDENT
-        for (i = first; i < last; i++) { /* beside a touch, a rise may be a part of its load */
-            const float rise = highest(a.smooth[i], a.smooth[i] * other_side);
-            a.flag[i] &= (a.settling_s[i] < beside_s) | (rise < rustle_share * a.off[i]);
+        for (i = first; i < last; i++) { /* beside a touch, a rise may be its load; falls alone would be noise */
+            a.flag[i] &= (a.settling_s[i] < beside_s) | (fabsf(a.smooth[i]) < rustle_share * a.off[i]);
         }
         INDEPENDENT
         for (i = first; i < last; i++) {

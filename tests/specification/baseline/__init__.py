@@ -249,7 +249,7 @@ class SpecifiedBaseline:
             floor = np.where(touches.remainders.used > 0, quick, floor)
             learns = live & ~touches.touched & ~self._falls.sagging & touches.remainders.has_settled
             learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
-            learns &= ~self._surroundings.beside | (touches.load(touches.smooth) < rustle)
+            learns &= ~self._surroundings.beside | (np.abs(touches.smooth) < rustle)
             calm = learns & (np.abs(touches.smooth) < rustle)
             offsets.learn(deviation, learns, calm, floor, passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)

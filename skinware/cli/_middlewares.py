@@ -13,7 +13,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, say
-from skinware.errors import ConfigurationError, MissingExtra
+from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from skinware.conversion.live import Sink
@@ -285,10 +285,9 @@ def rerun(
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
-    try:
-        import rerun
-    except ImportError:
-        raise MissingExtra("this needs a package that is not installed: pip install 'skinware[rerun]'") from None
+    from skinware.conversion.tables import package
+
+    rerun = package("rerun", "this", extra="rerun")  # before the sink, which imports it
     from skinware.conversion.live import RerunSink
 
     recording = rerun.RecordingStream("skinware")
@@ -322,10 +321,9 @@ def foxglove(
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
-    try:
-        import foxglove
-    except ImportError:
-        raise MissingExtra("this needs a package that is not installed: pip install 'skinware[foxglove]'") from None
+    from skinware.conversion.tables import package
+
+    foxglove = package("foxglove", "this", extra="foxglove")  # before the sink, which imports it
     from skinware.conversion.live import FoxgloveSink
 
     context = foxglove.Context()

@@ -43,8 +43,8 @@ Block = dict[str, npt.NDArray[Any]]
 """m rows of arrays, by name."""
 
 
-def package(name: str, what: str) -> Any:
-    """Return a package of the extra ``convert``, imported when it is needed.
+def package(name: str, what: str, *, extra: str = "convert") -> Any:
+    """Return a package of an extra, imported when it is needed.
 
     Raises:
         MissingExtra: it is not installed; ``what`` needs it.
@@ -52,7 +52,7 @@ def package(name: str, what: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise MissingExtra(f"{what} needs a package that is not installed: pip install 'skinware[convert]'") from None
+        raise MissingExtra(f"{what} needs a package that is not installed: pip install 'skinware[{extra}]'") from None
 
 
 def pyarrow() -> Any:

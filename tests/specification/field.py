@@ -31,7 +31,7 @@ TINY = float(np.float32(1e-12))
 
 
 class State(IntEnum):
-    """What explains the value of a taxel in a frame."""
+    """The explanation of a taxel's value in a frame: rest, a steady load, or something else."""
 
     NONE, REST, STEADY, ELSE = range(4)
 
@@ -112,7 +112,7 @@ class _Array:
         self.variance[at] = self.covariance[at] @ u @ u
 
     def _set_level(self, rows: npt.NDArray[np.intp], values: Doubles, field: Doubles) -> None:
-        """Take present values for levels. What a response may be wrong by, its level is wrong by as well."""
+        """Take present values for levels; the error of a response is also in its level."""
         self._compare(values, field, rows)
         self.response[rows, 3] += self.rest[rows]
         p = self.covariance

@@ -13,6 +13,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import zlib
 from functools import cache
 from pathlib import Path
 
@@ -25,7 +26,10 @@ OPTIONS = ["-O3", "-std=c11", "-fPIC", "-shared", "-fvisibility=hidden"]
 OPTIONS += ["-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]  # loops over taxels
 OPTIONS += shlex.split(os.environ.get("CFLAGS", ""))
 LINKER = ["-lm", *shlex.split(os.environ.get("LDFLAGS", ""))]
-HEADERS = [str(header) for header in Path().glob("skinware*/native/*.h")]
+HEADERS = {
+    "skinware": ["skinware/include", "skinware/native"],
+    "skinware_drivers": ["skinware/include", "skinware/native", "skinware_drivers/native"],
+}
 ZIG = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
 PROBE = "#include <sys/epoll.h>\nint probe(void);\nint probe(void) { return EPOLLIN; }\n"
 MISSING = (
@@ -71,7 +75,12 @@ def compiler() -> list[str]:
 
 def native(package: str) -> Extension:
     sources = [str(source) for source in sorted(Path(package, "native").glob("*.c"))]
-    return Extension(f"{package}.native.lib{package}", sources, depends=HEADERS)
+    headers = [header for folder in HEADERS[package] for header in sorted(Path(folder).glob("*.h"))]
+    checksum = zlib.crc32(b"".join(header.read_bytes() for header in headers))
+    macros = [("SKINWARE_HEADERS", f"{checksum}u")]  # skinware.native compares it before it calls the library
+    return Extension(
+        f"{package}.native.lib{package}", sources, depends=[str(header) for header in headers], define_macros=macros
+    )
 
 
 class SharedLibraries(build_ext):
@@ -89,7 +98,8 @@ class SharedLibraries(build_ext):
     def build_extension(self, ext: Extension) -> None:
         library = Path(self.get_ext_fullpath(ext.name))
         library.parent.mkdir(parents=True, exist_ok=True)
-        command = [*compiler(), *OPTIONS, "-o", str(library), *ext.sources, *LINKER]
+        macros = [f"-D{name}={value}" for name, value in ext.define_macros]
+        command = [*compiler(), *OPTIONS, *macros, "-o", str(library), *ext.sources, *LINKER]
         try:
             subprocess.run(command, check=True)
         except (OSError, subprocess.CalledProcessError) as error:

@@ -121,7 +121,7 @@ def BridgeError(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
 
 @produces
 def PlatformError(_: pytest.MonkeyPatch) -> object:  # noqa: N802
-    return native.load(Path("libskinware.so"), native.ABI)
+    return native.load(Path("libskinware.so"), native.FOLDERS)
 
 
 @produces

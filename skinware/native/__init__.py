@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import re
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +19,13 @@ import numpy.typing as npt
 
 from skinware.errors import PlatformError
 
-__all__ = ["ABI", "Library", "core", "load"]
+__all__ = ["FOLDERS", "Library", "checksum", "core", "load"]
 
-ABI = 12
-"""Number of the interface of ``library.c``: both change together."""
+_HERE = Path(__file__).parent
+_CORE = _HERE / "libskinware.so"
 
-_CORE = Path(__file__).with_name("libskinware.so")
+FOLDERS = (_HERE.parent / "include", _HERE)
+"""Folders of the headers that the library of the core is compiled with."""
 
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 _STRUCT = re.compile(r"^struct (\w+) \{(.*?)^\};", re.DOTALL | re.MULTILINE)
@@ -53,25 +55,31 @@ class Library:
     quick: ctypes.PyDLL
 
 
+def checksum(folders: Iterable[Path]) -> int:
+    """Return the checksum of the headers in folders, as setup.py gives it to the compiler."""
+    headers = [header for folder in folders for header in sorted(folder.glob("*.h"))]
+    return zlib.crc32(b"".join(header.read_bytes() for header in headers))
+
+
 @functools.cache
-def load(file: Path, abi: int) -> Library:
-    """Load a library of this package once for the process, if its ``skinware_native_abi`` returns this number."""
+def load(file: Path, folders: tuple[Path, ...]) -> Library:
+    """Load a library of this package once for the process, if it was compiled with the headers in these folders."""
     try:
         file.stat()
         library = Library(ctypes.CDLL(str(file)), ctypes.PyDLL(str(file)))
-        found = library.quick.skinware_native_abi()
+        found, wanted = library.quick.skinware_native_headers() & 0xFFFFFFFF, checksum(folders)
     except FileNotFoundError:
         raise PlatformError(f"{file} is missing: install this package again, which compiles it") from None
     except (OSError, AttributeError) as error:
         raise PlatformError(f"{file} cannot be loaded ({error}): install this package again") from None
-    if found != abi:
-        raise PlatformError(f"{file} has interface {found}, not {abi}: install this package again, which compiles it")
+    if found != wanted:
+        raise PlatformError(f"{file} was compiled with other headers: install this package again, which compiles it")
     return library
 
 
 def core() -> Library:
     """Return the library of the core."""
-    return load(_CORE, ABI)
+    return load(_CORE, FOLDERS)
 
 
 def _fields(declaration: str, kinds: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:

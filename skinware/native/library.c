@@ -5,21 +5,19 @@
 
 #include "ring.h"
 
-/* Changes whenever a function or structure here does; skinware/native/__init__.py has the same number. */
-#define ABI 12
-
 /* What a copy can come to. */
 enum { NOTHING = 0, COPIED = 1, OVERTAKEN = -1 };
 
-SKINWARE_EXPORT uint32_t skinware_native_abi(void);
+SKINWARE_EXPORT uint32_t skinware_native_headers(void);
 SKINWARE_EXPORT void skinware_native_fence(void);
 SKINWARE_EXPORT int skinware_native_copy(const skinware__ring *ring, uint64_t wanted, unsigned char *to);
 SKINWARE_EXPORT void skinware_native_begin(skinware_ring_writer *writer, uint64_t skipped);
 SKINWARE_EXPORT uint64_t skinware_native_commit(skinware_ring_writer *writer, int64_t acquired_ns, uint64_t flags);
 SKINWARE_EXPORT void skinware_native_wake(const skinware_ring_writer *writer);
 
-uint32_t skinware_native_abi(void) {
-    return ABI;
+/* The checksum of the headers that this was compiled with. */
+uint32_t skinware_native_headers(void) {
+    return SKINWARE_HEADERS;
 }
 
 /* Orders everything before it against everything after it. */

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import skinware.native
 
-ABI = 9
-"""Number of the interface of ``path.c``; both change together."""
+_HERE = Path(__file__).parent
+_FILE = _HERE / "libskinware_drivers.so"
 
-_FILE = Path(__file__).with_name("libskinware_drivers.so")
+FOLDERS = (*skinware.native.FOLDERS, _HERE)
+"""Folders of the headers that the library is compiled with."""
 
 
 def library() -> skinware.native.Library:
     """Return the library of the data path."""
-    return skinware.native.load(_FILE, ABI)
+    return skinware.native.load(_FILE, FOLDERS)

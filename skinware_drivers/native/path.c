@@ -3,24 +3,12 @@
 
 #include <stdlib.h>
 
-enum { ABI = 9, FIRST_UPDATES = 64 };
+enum { FIRST_UPDATES = 64 };
 
-SKINWARE_EXPORT uint32_t skinware_native_abi(void)
+/* The checksum of the headers that this was compiled with. */
+SKINWARE_EXPORT uint32_t skinware_native_headers(void)
 {
-    return ABI;
-}
-
-/* Sizes of what Python describes, so that it can see whether it describes the same. */
-SKINWARE_EXPORT int64_t skinware_path_size(int64_t which)
-{
-    const size_t sizes[] = {sizeof(struct plan),   sizeof(struct words),  sizeof(struct batch), sizeof(struct kind),
-                            sizeof(struct flag),   sizeof(struct run),    sizeof(struct form),  sizeof(struct cycle),
-                            sizeof(struct number), sizeof(struct assembly), sizeof(struct flow),
-                            sizeof(struct source), sizeof(struct framing),  sizeof(struct stream),
-                            sizeof(struct asker),  sizeof(struct asked_read), sizeof(struct asked_block),
-                            sizeof(struct tap),
-                            sizeof(struct update)};
-    return which >= 0 && which < (int64_t)(sizeof sizes / sizeof *sizes) ? (int64_t)sizes[which] : -1;
+    return SKINWARE_HEADERS;
 }
 
 static void *room(struct path *path, int64_t n, size_t size)

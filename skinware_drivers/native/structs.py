@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.native import read_structs
-from skinware_drivers.wire_tap import Kept
 
 _HEADERS = ("path.h", "inside.h", "framing.h", "flow.h")
 _OF_C_ALONE = ("path", "chain")
@@ -27,14 +26,6 @@ def __getattr__(name: str) -> Any:
     if name not in _classes:
         raise AttributeError(f"the headers have no struct for {name}")
     return _classes[name]
-
-
-_MEASURED = (
-    *("Plan", "Words", "Batch", "Kind", "Flag", "Run", "Form", "Cycle", "Number", "Assembly", "Flow", "Source"),
-    *("Framing", "Stream", "Asker", "AskedRead", "AskedBlock", "Tap", "Update"),
-)
-SIZES = tuple(ctypes.sizeof(Kept if name == "Tap" else _classes[name]) for name in _MEASURED)
-"""The sizes that ``skinware_path_size`` returns, if the library was compiled with these headers."""
 
 
 class Arrays:

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 import skinware.native
-from skinware.errors import PlatformError
 from skinware.realtime import now_ns
 from skinware.samples import Unused
 from skinware.status import PatchState, Status
@@ -259,11 +258,6 @@ _SKIPPED = OWN_BUS_COUNTERS.index("updates_skipped")
 def _library() -> skinware.native.Library:
     library = native.library()
     quick, waiting = library.quick, library.waiting
-    size = quick.skinware_path_size
-    size.argtypes, size.restype = [ctypes.c_int64], ctypes.c_int64
-    found = tuple(size(number) for number in range(len(structs.SIZES)))
-    if found != structs.SIZES:
-        raise PlatformError(f"the data path in C has structures of {found} bytes, not {structs.SIZES}")
     quick.skinware_path_new.restype = ctypes.c_void_p
     for call in (quick.skinware_path_deadline_ns, waiting.skinware_path_digest, waiting.skinware_flow_run):
         call.restype = ctypes.c_int64

@@ -5,6 +5,7 @@
  * undefined behaviour and of races. Prints what was compared as one line of JSON.
  */
 
+#define SKINWARE_HEADERS 0 /* not loaded from Python */
 #include "../../skinware/native/library.c"
 #include "../../skinware/native/take.c"
 
@@ -148,7 +149,7 @@ int main(int count, char **arguments) {
         return 3;
     descriptor = open(arguments[1], O_RDONLY);
     map = (unsigned char *)mmap(NULL, size, PROT_READ | PROT_WRITE, MAP_SHARED, owner, 0);
-    if (descriptor < 0 || map == MAP_FAILED || skinware_native_abi() != ABI)
+    if (descriptor < 0 || map == MAP_FAILED || skinware_native_headers() != SKINWARE_HEADERS)
         return 4;
     skinware_native_fence();
     for (i = 0; i < READERS; i++) {

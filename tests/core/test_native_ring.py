@@ -288,18 +288,19 @@ def test_a_killed_writer_is_noticed_by_a_loop() -> None:
 # -- the library ---------------------------------------------------------------------------------------------------
 
 
-def test_a_library_of_another_version_is_refused() -> None:
-    with pytest.raises(PlatformError, match=f"has interface {native.ABI}, not {native.ABI + 1}: install this package"):
-        native.load(native._CORE, native.ABI + 1)
+def test_a_library_compiled_with_other_headers_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "ring.h").write_text("struct ring { int64_t other; };")
+    with pytest.raises(PlatformError, match="was compiled with other headers: install this package again"):
+        native.load(native._CORE, (*native.FOLDERS, tmp_path))
 
 
 def test_what_is_no_library_or_missing_is_refused(tmp_path: Path) -> None:
     broken = tmp_path / "libbroken.so"
     broken.write_bytes(b"no library")
     with pytest.raises(PlatformError, match=r"libbroken.so cannot be loaded .*: install this package again"):
-        native.load(broken, native.ABI)
+        native.load(broken, native.FOLDERS)
     with pytest.raises(PlatformError, match="is missing: install this package again"):
-        native.load(tmp_path / "libnothing.so", native.ABI)
+        native.load(tmp_path / "libnothing.so", native.FOLDERS)
 
 
 # -- the protocol under the checkers -------------------------------------------------------------------------------

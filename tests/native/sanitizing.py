@@ -10,7 +10,8 @@ import os
 import subprocess
 from pathlib import Path
 
-import skinware_drivers
+import skinware.native
+import skinware_drivers.native
 from tests.compiling import need_compiler
 
 COMPILER = "gcc"
@@ -29,7 +30,8 @@ def compile_sanitized(folder: Path) -> Path:
     library, coverage = folder / "libskinware_drivers.so", folder / "coverage.o"
     subprocess.run([COMPILER, "-O2", "-fPIC", "-c", "-o", coverage, _HERE / "coverage.c"], check=True)
     sources = sorted((Path(skinware_drivers.__file__).parent / "native").glob("*.c"))
-    subprocess.run([COMPILER, *_OPTIONS, "-o", library, *sources, coverage], check=True)
+    headers = f"-DSKINWARE_HEADERS={skinware.native.checksum(skinware_drivers.native.FOLDERS)}u"
+    subprocess.run([COMPILER, *_OPTIONS, headers, "-o", library, *sources, coverage], check=True)
     return library
 
 

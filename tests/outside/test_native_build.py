@@ -18,7 +18,8 @@ LIBRARIES = {
     "skinware_drivers/native/libskinware_drivers.so",
 }
 BROKEN_COMPILER = {"CC": "/bin/false"}
-SOURCES = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("skinware*/native/*.[ch]")}
+HEADERS = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("skinware*/native/*.h")}
+SOURCES = {path.relative_to(ROOT).as_posix() for path in ROOT.glob("skinware*/native/*.c")} | HEADERS
 
 
 @pytest.fixture
@@ -53,10 +54,12 @@ def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("compiler")
-def test_a_wheel_has_the_libraries_and_serves_every_python(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_wheel_has_the_libraries_with_their_headers_and_serves_every_python(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
     wheel = built_wheel(tmp_path_factory)
     native_files = {name for name in zipfile.ZipFile(wheel).namelist() if "/native/" in name}
-    assert {name for name in native_files if not name.endswith(".py")} == LIBRARIES
+    assert {name for name in native_files if not name.endswith(".py")} == LIBRARIES | HEADERS
     assert wheel.name.partition("-py3-none-linux_")[1]
 
 

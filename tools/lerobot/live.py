@@ -33,7 +33,7 @@ FPS, SECONDS, EPISODES, TIE_NS, LONGEST_NS = 30, 4, 3, 300_000, 2_000_000_000
 def main() -> None:
     folder = Path(sys.argv[1])
     os.environ["SKINWARE_NAMESPACE"] = f"lerobot-{os.getpid()}"
-    os.environ["PYTHONPATH"] = f"{Path(__file__).parent}:{os.environ.get('PYTHONPATH', '')}"
+    os.environ["PYTHONPATH"] = str(Path(__file__).parent)
     print(f"lerobot {version('lerobot')}, live")
     for name, busy in (("quiet", 0), ("busy", 2)):
         check_rows(folder, name, busy)

@@ -217,6 +217,14 @@ class Structure:
         return {name: as_index(positions) for name, positions in self._index_by_type.items()}
 
     @cached_property
+    def _conversion(self) -> npt.NDArray[np.floating[Any]]:
+        """(2, n_sensors): scale and offset of each sensor."""
+        conversion = np.empty((2, self.n_sensors), np.float64 if self.dtype == np.int32 else np.float32)
+        for t in self.types:
+            conversion[:, self._span_by_type[t.name]] = [[t.scale], [t.offset]]
+        return conversion
+
+    @cached_property
     def _module_by_type(self) -> dict[str, npt.NDArray[np.int64]]:
         modules = self.sensor_module.astype(np.int64)
         return {name: frozen(modules[index]) for name, index in self._index_by_type.items()}
@@ -377,13 +385,13 @@ class Structure:
             (..., n) float32 in the type's unit, in the order of ``index(type_name)``; float64 if the raw values are
             int32, which have more digits than float32 holds.
         """
-        sensor_type = self.type(type_name)
-        raw = values[..., self.span(type_name)]
-        if self.dtype == np.int32:
-            exact: npt.NDArray[np.float64] = raw.astype(np.float64)
-            return exact * sensor_type.scale + sensor_type.offset
-        single: npt.NDArray[np.float32] = raw.astype(np.float32)
-        return single * np.float32(sensor_type.scale) + np.float32(sensor_type.offset)
+        at, (scale, offset) = self.span(type_name), self._conversion
+        return values[..., at].astype(scale.dtype) * scale[at] + offset[at]
+
+    def physical_values(self, values: npt.NDArray[np.generic]) -> npt.NDArray[np.floating[Any]]:
+        """Return (..., n_sensors) physical values of all sensors, each in the unit of its type; see :meth:`physical`."""
+        scale, offset = self._conversion
+        return values.astype(scale.dtype) * scale + offset
 
     def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return the tables as named columns, for a service's file."""

@@ -148,9 +148,7 @@ def skin_frame(frame: DriverSnapshot, time_ns: int, status: npt.NDArray[np.uint8
         status: (n_sensors,) of the sensors; default: as of the frame.
     """
     structure = frame.structure
-    values = np.zeros(structure.n_sensors)
-    for sensor_type in structure.types:
-        values[structure.index(sensor_type.name)] = structure.physical(frame.values, sensor_type.name)
+    values = structure.physical_values(frame.values).astype(np.float64)
     cdr = Cdr().header(acquired_ns(frame, time_ns), "").numbers("Q", frame.generation, frame.sequence)
     cdr.numbers("q", frame.acquired_ns, frame.published_ns)
     return cdr.array(values).array(frame.status if status is None else status).array(frame.module_time_ns).done()

@@ -149,6 +149,21 @@ class Calm:
     usable: Flags
 
 
+class _Given:
+    """Memory at one address that (n,) arrays are copied to for C, as finding the address of each takes longer."""
+
+    def __init__(self, n: int, dtype: npt.DTypeLike) -> None:
+        self._memory = np.empty(n, dtype)
+        self._at = self._memory.ctypes.data
+
+    def take(self, given: npt.ArrayLike | None) -> int | None:
+        """Return the address; None: nothing is given."""
+        if given is None:
+            return None
+        self._memory[:] = given
+        return self._at
+
+
 class Baseline:
     """Follows the baselines of the n taxels of one sensor type of one driver.
 
@@ -202,6 +217,7 @@ class Baseline:
         }
         self._arrays = give_arrays(words, n, room, given)
         self._at = ctypes.addressof(words)
+        self._given = [_Given(n, dtype) for dtype in (np.float32, np.bool_, np.bool_, np.bool_)]
         self.settings = settings or BaselineSettings()
         _begin(self._at)
 
@@ -297,12 +313,9 @@ class Baseline:
             jumped: (n,) bool, where the hardware moved its own baseline just before this frame; default: nowhere.
             bears: (n,) bool, where the vector of which a value is an axis bears a load; default: nowhere.
         """
-        n = self._n
-        given = self._checked(values, np.float32)
-        flags = [None if of is None else self._checked(of, np.bool_) for of in (usable, jumped, bears)]
-        memory = np.empty(_SHOWN * n, np.uint8)
-        at = [None if of is None else of.ctypes.data for of in (*flags, memory)]
-        _update(self._at, time_ns, given.ctypes.data, *at)
+        n, memory = self._n, np.empty(_SHOWN * self._n, np.uint8)
+        at = [given.take(of) for given, of in zip(self._given, (values, usable, jumped, bears), strict=True)]
+        _update(self._at, time_ns, *at, memory.ctypes.data)
         values_of = memory[: 16 * n].view(np.float32).reshape(4, n)
         flags_of = memory[16 * n :].view(np.bool_).reshape(5, n)
         return Calm(
@@ -316,10 +329,6 @@ class Baseline:
             forced=flags_of[3],
             usable=flags_of[4],
         )
-
-    def _checked(self, given: npt.ArrayLike, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-        array = np.asarray(given, dtype, order="C")
-        return array if array.shape == (self._n,) else np.array(np.broadcast_to(array, self._n))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return all that was learned, by name: arrays (n,), copies."""

@@ -248,11 +248,12 @@ class CalmService:
             return False
         chain.step(frame, columns["values"], columns["status"])
         chain.explain(columns["uncertainty"], columns["why"])
-        self.health.step(columns["status"], frame.acquired_ns)
-        self._warn(chain)
+        self.health.mark(columns["status"])
         writer.commit(frame.acquired_ns)
         self.contacts.publish(columns["values"], columns["status"], frame.acquired_ns)
         self.motion.publish(frame.acquired_ns)
+        self.health.update(frame.acquired_ns)  # after all that programs wait for
+        self._warn(chain)
         self._requests.published(frame.acquired_ns, writer)
         before, self._state = self._state, "running"
         return before == "waiting"

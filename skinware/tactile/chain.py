@@ -250,7 +250,8 @@ class Chain:
                     self.keep(name, stage, f"{name}/", f"{stage.name}.")
         self.vectors = [names for stage, names in steps if isinstance(stage, VectorStage)]
         self._before = structure
-        self._suspect: dict[str, Flags] = {}
+        self._staged = {name: structure.span(name) for name, stages in self.stages.items() if stages}
+        self._suspect: Flags | None = None
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
         self.structure: Structure = structure.replace(types=types, dtype=np.float32)
 
@@ -320,20 +321,23 @@ class Chain:
             temperature_c = temperature_of(frame)
             for curve in self.curve_stages.values():
                 curve.temperature_c = temperature_c
-        signals: dict[str, Signal] = {}
-        for name in self.stages:
-            suspect = (frame.status_of(name) & Status.SUSPECT) != 0
-            usable = (frame.status_of(name) & UNUSABLE) == 0
-            signals[name] = signal = Signal.of(frame.acquired_ns, frame.physical(name), usable)
-            signal.jumped = suspect & ~self._suspect.get(name, suspect)
-            self._suspect[name] = suspect
+        given: Floats = self._before.physical_values(frame.values).astype(np.float32, copy=False)
+        usable = ((status & UNUSABLE) == 0) & np.isfinite(given)
+        suspect = (status & Status.SUSPECT) != 0
+        jumped = np.zeros_like(suspect) if self._suspect is None else suspect & ~self._suspect
+        self._suspect = suspect
+        forced, unknown = np.zeros((2, len(given)), bool)
+        signals = {
+            name: Signal(frame.acquired_ns, given[at], usable[at], jumped[at], forced[at], unknown[at], given[at])
+            for name, at in self._staged.items()
+        }
         for stage, names in self._steps:
             stage.step(*(signals[name] for name in names))
-        for name, signal in signals.items():
-            index = self._before.index(name)
-            values[index] = signal.values
-            of_type = status[index] | np.where(signal.forced, np.uint8(Status.SUSPECT), np.uint8(0))
-            status[index] = of_type | np.where(signal.unknown, np.uint8(Status.NEVER_SEEN), np.uint8(0))
+        values[:] = given
+        for name, at in self._staged.items():
+            signal = signals[name]
+            values[at], forced[at], unknown[at] = signal.values, signal.forced, signal.unknown
+        status |= forced * np.uint8(Status.SUSPECT) | unknown * np.uint8(Status.NEVER_SEEN)
 
     def explain(self, uncertainty: Floats, why: Bytes) -> None:
         """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""

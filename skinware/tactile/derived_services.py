@@ -266,8 +266,13 @@ class CalmHealth(DerivedService[HealthWriter]):
         else:
             self._open(HealthWriter, chain.structure, self._driver)
 
-    def step(self, status: Bytes, acquired_ns: int) -> None:
-        """Take in what the chain made of the next frame; mark sensors with a fault in (n_sensors,) status."""
+    def mark(self, status: Bytes) -> None:
+        """Mark sensors with a fault in (n_sensors,) status."""
+        if self.judged is not None:
+            status |= self._status
+
+    def update(self, acquired_ns: int) -> None:
+        """Take in what the chain made of a frame, and judge the sensors when it is time."""
         if self.judged is None:
             return
         self.judged.update(acquired_ns)
@@ -279,4 +284,3 @@ class CalmHealth(DerivedService[HealthWriter]):
             if self.writer is not None:
                 with self._or_none():
                     self.writer.publish(reports, acquired_ns)
-        status |= self._status

@@ -59,7 +59,8 @@ class Calmed:
                 if not baseline.ready.any():
                     baseline.tare()
             self._time_ns += PERIOD_NS
-            self.health.step(self.status, self._time_ns)
+            self.health.update(self._time_ns)
+            self.health.mark(self.status)
         self.skin.values = rest
 
 
@@ -153,7 +154,8 @@ def test_without_sensors_that_a_touch_only_raises_there_is_none(into: Namespace)
     assert (health.name, into.services()) == ("health", ["health"])
     health.follow(ChainSettings.calm().chain(other))
     status = np.zeros(other.n_sensors, np.uint8)
-    health.step(status, 10**10)
+    health.update(10**10)
+    health.mark(status)
     assert not status.any()
     assert (health.name, into.services()) == ("", [])
     health.follow(ChainSettings.calm().chain(structure))

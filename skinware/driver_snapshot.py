@@ -150,6 +150,10 @@ class DriverSnapshot(Sample):
         """Return (n,) float32: values of all sensors of a type, in its unit; float64 where raw values are int32."""
         return self.structure.physical(self.values, type_name)
 
+    def physical_values(self) -> npt.NDArray[np.float32]:
+        """Return (n_sensors,) float32: values of all sensors, each in the unit of its type."""
+        return self.structure.physical_values(self.values).astype(np.float32, copy=False)
+
     def status_of(self, type_name: str) -> npt.NDArray[np.uint8]:
         """Return (n,) uint8: status of all sensors of a type."""
         return self.status[self.structure.span(type_name)]

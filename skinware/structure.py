@@ -389,7 +389,7 @@ class Structure:
         return values[..., at].astype(scale.dtype) * scale[at] + offset[at]
 
     def physical_values(self, values: npt.NDArray[np.generic]) -> npt.NDArray[np.floating[Any]]:
-        """Return (..., n_sensors) physical values of all sensors, each in the unit of its type; see :meth:`physical`."""
+        """Return (..., n_sensors) physical values of all sensors, in their units; else as :meth:`physical`."""
         scale, offset = self._conversion
         return values.astype(scale.dtype) * scale + offset
 

@@ -19,7 +19,7 @@ from skinware.structure import Structure
 from skinware.tactile.regions import Regions
 from skinware.text import measure_text, status_text, why_text
 from skinware.views.history import Memory
-from skinware.views.quantities import physical_values, types_of
+from skinware.views.quantities import types_of
 
 Levels = npt.NDArray[np.uint8]
 
@@ -102,7 +102,7 @@ class Picture:
     def draw(self, key: RowKey, frame: DriverSnapshot, width: int, height: int, life: str) -> None:
         """Draw a snapshot: set ``arrangement``, ``pixels`` and the texts; ``life`` says whether news comes."""
         structure = frame.structure
-        sensor_type, physical = self.type_in(structure), physical_values(frame)
+        sensor_type, physical = self.type_in(structure), frame.physical_values()
         memory = self._memories.get(key.driver)
         if memory is None or memory.structure is not structure:
             memory = self._memories[key.driver] = Memory(structure)

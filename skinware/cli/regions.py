@@ -115,14 +115,13 @@ def _paint(
     from skinware.tactile.neighbours import neighbours, without_holes
     from skinware.views.history import SETTLING_S, DriverRest, threshold
     from skinware.views.live import after, enter_pressed, frames_until
-    from skinware.views.quantities import physical_values
 
     structure = reader.structure
     index, rest = structure.index(type_name), DriverRest(structure)
 
     def touched(frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
         """Return (n,) bool: the sensors of the type that are far from rest."""
-        physical, fresh = physical_values(frame), frame.status == 0
+        physical, fresh = frame.physical_values(), frame.status == 0
         rest.follow(physical, fresh, frame.published_ns)
         is_far = rest.change(physical)[index] > threshold(rest.noise(type_name))
         is_touched: npt.NDArray[np.bool_] = fresh[index] & is_far

@@ -145,11 +145,10 @@ class _Wipe:
     def _frames(self, duration_s: float | None) -> Iterator[tuple[DriverSnapshot, npt.NDArray[np.float32]]]:
         """Yield snapshots with their (n_sensors,) physical values."""
         from skinware.views.live import after, frames_until
-        from skinware.views.quantities import physical_values
 
         for frame in frames_until(self._reader, after(math.inf if duration_s is None else duration_s)):
             self._status = frame.status
-            yield frame, physical_values(frame)
+            yield frame, frame.physical_values()
 
 
 main = partial(cli.run, command)

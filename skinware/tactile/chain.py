@@ -321,7 +321,7 @@ class Chain:
             temperature_c = temperature_of(frame)
             for curve in self.curve_stages.values():
                 curve.temperature_c = temperature_c
-        given: Floats = self._before.physical_values(frame.values).astype(np.float32, copy=False)
+        given = frame.physical_values()
         usable = ((status & UNUSABLE) == 0) & np.isfinite(given)
         suspect = (status & Status.SUSPECT) != 0
         jumped = np.zeros_like(suspect) if self._suspect is None else suspect & ~self._suspect

@@ -204,14 +204,6 @@ def pads_of(structure: Structure) -> Pads:
     return Pads(of_sensor.astype(np.int64), names.tolist(), modules.tolist(), part >= 0)
 
 
-def physical_values(frame: DriverSnapshot) -> npt.NDArray[np.float32]:
-    """Return (n_sensors,) float32, every value of a snapshot in the unit of its type."""
-    physical = np.empty(frame.structure.n_sensors, np.float32)
-    for sensor_type in frame.structure.types:
-        physical[frame.structure.index(sensor_type.name)] = frame.physical(sensor_type.name)
-    return physical
-
-
 def levels_of(values: npt.NDArray[np.floating[Any]], status: npt.NDArray[np.uint8], low: float, high: float) -> Levels:
     """Return (n,) uint8: where values lie between ``low`` (0) and ``high`` (250) in even steps; 255 without a value.
 
@@ -275,7 +267,7 @@ class Newest:
 
     def all_physical(self) -> npt.NDArray[np.float32]:
         """Return (n_sensors,) float32, values of the sensors of all types, each in its unit."""
-        return self.once("all", lambda: physical_values(self.frame))
+        return self.once("all", lambda: self.frame.physical_values())
 
     def above_baseline(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]] | None:
         """Return (n,) how far values are above their baselines, 0 without touch; None without a calmed driver."""

@@ -90,6 +90,9 @@ def test_physical_values_use_scale_and_offset() -> None:
     raw = np.array([240, 0, 7, 9], np.uint8)
     assert structure.physical(raw, "pressure").tolist() == [15.0, 255.0]
     assert structure.physical(raw, "temperature").tolist() == [7.0, 9.0]
+    both = structure.physical_values(np.stack([raw, raw]))
+    for name in ("pressure", "temperature"):
+        assert both[:, structure.index(name)].tolist() == 2 * [structure.physical(raw, name).tolist()]
     with pytest.raises(StructureError, match="there are: pressure, temperature"):
         structure.physical(raw, "shear_x")
 

@@ -72,11 +72,8 @@ class Frame(NamedTuple):
     def status(self) -> npt.NDArray[np.uint8]:
         return np.zeros(self.structure.n_sensors, np.uint8)
 
-    def status_of(self, name: str) -> npt.NDArray[np.uint8]:
-        return self.status[self.structure.index(name)]
-
-    def physical(self, name: str) -> npt.NDArray[np.float64]:
-        return self.values[self.structure.index(name)]
+    def physical_values(self) -> npt.NDArray[np.float32]:
+        return self.values.astype(np.float32)
 
 
 def magnetometers(n: int = 8) -> Structure:

@@ -103,15 +103,16 @@ class FakeSkin:
             slots=slots,
         )
 
-    def publish(self, count: int = 1) -> None:
-        """Publish frames."""
+    def publish(self, count: int = 1, acquired_ns: int | None = None) -> None:
+        """Publish frames; default: of now."""
         for _ in range(count):
+            time_ns = time.monotonic_ns() if acquired_ns is None else acquired_ns
             columns = self.writer.begin()
             columns["values"][:] = self._touched() if self.values is None else self.values
             columns["status"][:] = self.status
             if self.why is not None:
                 columns["why"][:] = self.why
-            columns["module_time_ns"][:] = time.monotonic_ns()
+            columns["module_time_ns"][:] = time_ns
             columns["module_untouched"][:] = 0 if self.untouched is None else self.untouched
             columns["patch_state"][:] = self.patch_state
             columns["bus_state"][:] = self.bus_state
@@ -125,7 +126,7 @@ class FakeSkin:
             columns["patch_age_counts"][:] = self.age_counts.ravel()
             columns["bus_counters"][:] = self.bus_counters.ravel()
             columns["patch_counters"][:] = self.patch_counters.ravel()
-            self.writer.commit(time.monotonic_ns())
+            self.writer.commit(time_ns)
 
     def break_some(self) -> None:
         """Make a few sensors, the last patch and some counters tell of trouble."""

@@ -53,12 +53,9 @@ class Calmed:
             self.skin.values = rest + self._random.integers(0, 2, len(rest))
             self.skin.values[RUSTLING] += self._random.integers(-20, 20)
             self.skin.values[AT_END] = rest[AT_END]
-            self.skin.publish()
-            self.chain.step(self._reader.read(), self._values, self.status)
-            for baseline in self.chain.baselines.values():
-                if not baseline.ready.any():
-                    baseline.tare()
             self._time_ns += PERIOD_NS
+            self.skin.publish(acquired_ns=self._time_ns)
+            self.chain.step(self._reader.read(), self._values, self.status)
             self.health.update(self._time_ns)
             self.health.mark(self.status)
         self.skin.values = rest

@@ -33,7 +33,8 @@ print(json.dumps(paper_run.COLUMNS))
 def test_the_papers_experiment_writes_one_row_per_trial(tmp_path: Path) -> None:
     path = tmp_path / "results.csv"
     modes = ["asap", "skin", *(["c asap", "c skin"] if shutil.which("cc") else [])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(BENCHMARKS), os.environ.get("PYTHONPATH", "")))}
+    path_of_modules = os.pathsep.join(filter(None, (str(BENCHMARKS), os.environ.get("PYTHONPATH"))))
+    environment = {**os.environ, "PYTHONPATH": path_of_modules}
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, path, *modes],
         env=environment,

@@ -160,3 +160,9 @@ def test_a_library_older_than_its_sources_is_compiled_again(project: Path, compi
     os.utime(compiling, (earlier_s, earlier_s))
     assert installs(project)
     assert not installs(project)
+
+
+@pytest.mark.thorough
+def test_the_figures_of_the_house_may_be_cut_short() -> None:
+    done = subprocess.run(["bash", "-c", f"{TOOLS}/house | true"], capture_output=True, text=True)
+    assert done.stderr == ""

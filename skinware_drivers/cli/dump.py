@@ -130,7 +130,7 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
     for sensor_type in frame.structure.types:
         if type_name in (None, sensor_type.name):
             index = frame.structure.index(sensor_type.name)
-            fresh = frame.status[index] == 0
+            fresh = frame.fresh(sensor_type.name)
             not_fresh += int(np.count_nonzero(~fresh))
             values = all_values[index][fresh]
             figures, mean = NO_VALUE, ""

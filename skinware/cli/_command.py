@@ -220,12 +220,18 @@ def log_to_stderr(verbose: bool) -> None:
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
 
 
+def ending_signals() -> list[signal.Signals]:
+    """Return the signals that end a command in good order: SIGHUP (its terminal is closed) unless nohup ignores it."""
+    hangup = [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
+    return [signal.SIGINT, signal.SIGTERM, *hangup]
+
+
 @contextlib.contextmanager
 def signals_end(
     stop: Callable[[], object], others: Mapping[signal.Signals, Callable[[], object]] | None = None
 ) -> Iterator[None]:
-    """Let SIGINT and SIGTERM call ``stop`` in the main thread, which ends the block; and other signals other things."""
-    calls = {signal.SIGINT: stop, signal.SIGTERM: stop, **(others or {})}
+    """Let the ending signals call ``stop`` in the main thread, which ends the block; and other signals other things."""
+    calls = {**dict.fromkeys(ending_signals(), stop), **(others or {})}
     before = {number: signal.signal(number, lambda *_, call=call: call()) for number, call in calls.items()}
     try:
         yield
@@ -237,12 +243,13 @@ def signals_end(
 def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     """Run a command with the arguments of this process, and exit with the status of :func:`exit_status`.
 
-    SIGTERM ends a command as Ctrl-C does.
+    SIGTERM and a closed terminal end a command as Ctrl-C does.
 
     Args:
         goes_on: its work goes on while its output is not read; by default it waits for the reader, as ``| less`` needs.
     """
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in ending_signals()[1:]:
+        signal.signal(number, signal.default_int_handler)
     with patient_output() if goes_on else contextlib.nullcontext():
         status = exit_status(command, sys.argv[1:])
     sys.exit(status)

@@ -10,7 +10,6 @@ import ipaddress
 import os
 import re
 import secrets
-import signal
 import socket
 import ssl
 import sys
@@ -162,7 +161,7 @@ async def _serve(
     from skinware.views.server import ViewServer
 
     stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in cli.ending_signals():
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     origin = follower.origins[0]
     namespace = origin.namespace.name

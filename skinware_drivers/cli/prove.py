@@ -181,9 +181,7 @@ def _captured(
 @contextlib.contextmanager
 def _interrupted_once() -> Iterator[Callable[[], None]]:
     """Let Ctrl-C, SIGTERM or a closed terminal interrupt the block once; yield a function that ends that."""
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
-        numbers.append(signal.SIGHUP)
+    numbers = cli.ending_signals()
 
     def undisturbed() -> None:
         for number in numbers:

@@ -17,7 +17,7 @@ import pytest
 from skinware import DriverReader, Namespace, ServiceWriter, Status
 from skinware.cli._command import exit_status
 from skinware.errors import ServiceNotFound, ServiceTimeout
-from skinware_drivers.cli.dump import _attach, _frames, _reattach, command
+from skinware_drivers.cli.dump import _attach, _frames, _reattach, as_line, command
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.commands import BIN, PATIENCE_S
 
@@ -91,6 +91,15 @@ def test_people_see_a_line_per_frame(capsys: pytest.CaptureFixture[str]) -> None
         assert exit_status(command, ["-n", "1", "--type", "pressure"]) == 0
         line = capsys.readouterr().out
         assert re.fullmatch(r"a #1  age [\d.]+ ms  pressure 247 to 255 counts \(mean 251\)  1 not fresh\n", line)
+
+
+def test_the_last_frame_of_a_driver_that_hangs_is_not_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    with FakeSkin("a", fake_structure(1, 1)) as skin, DriverReader("a") as reader:
+        skin.publish()
+        frame = reader.read()
+        assert as_line(frame, "pressure", False).endswith("  0 not fresh")
+        monkeypatch.setattr("skinware.driver_snapshot.now_ns", lambda: frame.acquired_ns + 5 * 10**9)
+        assert as_line(frame, "pressure", False).endswith("  pressure - counts  10 not fresh")
 
 
 def test_at_a_rate_only_the_newest_frame_and_each_once(capsys: pytest.CaptureFixture[str]) -> None:
@@ -239,7 +248,7 @@ def test_frames_end_with_the_timeout() -> None:
 
 
 @pytest.mark.parametrize("form", ["--json", pytest.param("--counts", marks=pytest.mark.thorough)])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_end_it_in_good_order(form: str, number: int, namespace: Namespace) -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))):
         process = subprocess.Popen([BIN / "skin-dump", form], stdout=subprocess.PIPE, stderr=subprocess.PIPE)

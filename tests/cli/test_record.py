@@ -34,7 +34,9 @@ from tests.unprivileged import without_rights_to_all_files
 KILLS = 3
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize(
+    "number", [signal.SIGHUP, signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)]
+)
 def test_it_records_what_comes_and_ends_whole(tmp_path: Path, namespace: Namespace, number: int) -> None:
     file = tmp_path / "skin.mcap"
     with running("skin-record", str(file)) as recorder:

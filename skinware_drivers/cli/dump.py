@@ -98,10 +98,8 @@ def command(
 
 def as_data(reader: DriverReader, frame: DriverSnapshot, type_name: str | None, counts: bool) -> dict[str, Any]:
     """Return a snapshot for JSON; with ``type_name`` only those sensors, with their uids."""
-    from skinware.views.quantities import physical_values
-
     index: Index = slice(None) if type_name is None else frame.structure.index(type_name)
-    values = (frame.values if counts else physical_values(frame))[index]
+    values = (frame.values if counts else frame.physical_values())[index]
     data = {
         "driver": reader.name,
         "sequence": frame.sequence,
@@ -122,10 +120,9 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
     import numpy as np
 
     from skinware.text import NO_VALUE, age_text, figure_text
-    from skinware.views.quantities import physical_values
 
     parts = [f"#{frame.sequence}", f"age {age_text(frame.age_ns)}"]
-    all_values = frame.values if counts else physical_values(frame)
+    all_values = frame.values if counts else frame.physical_values()
     not_fresh = 0
     for sensor_type in frame.structure.types:
         if type_name in (None, sensor_type.name):

@@ -98,7 +98,7 @@ def test_the_last_frame_of_a_driver_that_hangs_is_not_fresh(monkeypatch: pytest.
         skin.publish()
         frame = reader.read()
         assert as_line(frame, "pressure", False).endswith("  0 not fresh")
-        monkeypatch.setattr("skinware.driver_snapshot.now_ns", lambda: frame.acquired_ns + 10**15)
+        monkeypatch.setattr("skinware.driver_snapshot.now_ns", lambda: frame.acquired_ns + 10**16)
         assert as_line(frame, "pressure", False).endswith("  pressure - counts  10 not fresh")
 
 

@@ -231,7 +231,8 @@ class Tracker:
 
     def _find(self, tracks: Tracks, blobs: TouchedBlobs, size: Whole, time_ns: int) -> None:
         """Measure where each track is in this frame, and correct what was expected of it."""
-        pitch_m, home = self._pitch_m, tracks["home"]
+        pitch_m = self._pitch_m
+        home: Whole = tracks["home"]  # a view: tracks that are given up below are -1 here, too
         alone = np.flatnonzero((home >= 0) & ~tracks["shared"])
         blob = home[alone]
         tracks["found"][alone], tracks["noise"][alone] = blobs.cop_m[blob], (_NOISE_PITCHES * pitch_m) ** 2 / size[blob]
@@ -244,10 +245,10 @@ class Tracker:
         correct(tracks, alone, time_ns)
         for one in set(home[tracks["shared"]].tolist()):
             self._tell_apart(tracks, np.flatnonzero(home == one), blobs, time_ns)
-        here = np.flatnonzero(tracks["home"] >= 0)
+        here = np.flatnonzero(home >= 0)
         tracks["seen_ns"][here], tracks["gone_ns"][here] = time_ns, 0
-        tracks["frames"][here] += blobs.frames[tracks["home"][here]]
-        tracks["sure"][here] |= blobs.is_sure[tracks["home"][here]]
+        tracks["frames"][here] += blobs.frames[home[here]]
+        tracks["sure"][here] |= blobs.is_sure[home[here]]
 
     def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: TouchedBlobs, time_ns: int) -> None:
         """Find the tracks that share a blob, each with its own bell."""
@@ -293,16 +294,23 @@ class Tracker:
         passed_s[known] = np.maximum(time_ns - before["seen_ns"][here[known]], 0) / NS_PER_S
         is_new = ~known
         weight = np.where(is_new, 1.0, -np.expm1(-passed_s / settings.velocity_s))
-        now["load"] += weight * (now["now"] - now["load"])
-        alone = np.maximum(weight, 1 / now["frames"]) * ~now["shared"]
-        now["peak"] += alone * (now["height"] - now["peak"])
-        width = pitch_m * np.sqrt(now["now"] / (2 * np.pi * np.maximum(now["height"], 1e-9)))
-        now["width"] += alone * (np.maximum(width, _NARROWEST_PITCHES * pitch_m) - now["width"])
+        found: Doubles = now["now"]
+        height: Doubles = now["height"]
+        load: Doubles = now["load"]
+        peak: Doubles = now["peak"]
+        width: Doubles = now["width"]
+        motion: Doubles = now["motion"]
+        frames: Whole = now["frames"]
+        alone = np.maximum(weight, 1 / frames) * ~now["shared"]
         calm = -np.expm1(-passed_s / (_CALM * settings.velocity_s))[:, None]
-        now["motion"] += calm * (without_nan(now["velocity"]) - now["motion"])
-        is_steady = abs(now["now"] - now["load"]) <= settings.steady * now["load"]
+        load += weight * (found - load)
+        peak += alone * (height - peak)
+        measured = pitch_m * np.sqrt(found / (2 * np.pi * np.maximum(height, 1e-9)))
+        width += alone * (np.maximum(measured, _NARROWEST_PITCHES * pitch_m) - width)
+        motion += calm * (without_nan(now["velocity"]) - motion)
+        is_steady = abs(found - load) <= settings.steady * load
         slowest = np.where(now["kind"] == ContactKind.SLIDING, settings.sliding_m_s / 2, settings.sliding_m_s)
-        is_sliding = is_steady & (np.linalg.norm(now["motion"], axis=1) >= slowest)
+        is_sliding = is_steady & (np.linalg.norm(motion, axis=1) >= slowest)
         is_old = time_ns - now["born_ns"] >= settings.touch_s * NS_PER_S
         now["kind"] = np.where(is_old, np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD), ContactKind.TOUCH)
         if now is not tracks:

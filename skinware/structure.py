@@ -217,12 +217,13 @@ class Structure:
         return {name: as_index(positions) for name, positions in self._index_by_type.items()}
 
     @cached_property
-    def _conversion(self) -> npt.NDArray[np.floating[Any]]:
-        """(2, n_sensors): scale and offset of each sensor."""
-        conversion = np.empty((2, self.n_sensors), np.float64 if self.dtype == np.int32 else np.float32)
+    def _conversion(self) -> tuple[npt.NDArray[np.floating[Any]], npt.NDArray[np.floating[Any]]]:
+        """(n_sensors,) scale and (n_sensors,) offset of the sensors."""
+        scale, offset = np.empty((2, self.n_sensors), np.float64 if self.dtype == np.int32 else np.float32)
         for t in self.types:
-            conversion[:, self._span_by_type[t.name]] = [[t.scale], [t.offset]]
-        return conversion
+            span = self._span_by_type[t.name]
+            scale[span], offset[span] = t.scale, t.offset
+        return scale, offset
 
     @cached_property
     def _module_by_type(self) -> dict[str, npt.NDArray[np.int64]]:

@@ -387,12 +387,14 @@ class Structure:
             int32, which have more digits than float32 holds.
         """
         at, (scale, offset) = self.span(type_name), self._conversion
-        return values[..., at].astype(scale.dtype) * scale[at] + offset[at]
+        physical: npt.NDArray[np.floating[Any]] = values[..., at].astype(scale.dtype) * scale[at] + offset[at]
+        return physical
 
     def physical_values(self, values: npt.NDArray[np.generic]) -> npt.NDArray[np.floating[Any]]:
         """Return (..., n_sensors) physical values of all sensors, in their units; else as :meth:`physical`."""
         scale, offset = self._conversion
-        return values.astype(scale.dtype) * scale + offset
+        physical: npt.NDArray[np.floating[Any]] = values.astype(scale.dtype) * scale + offset
+        return physical
 
     def to_columns(self) -> dict[str, npt.NDArray[np.generic]]:
         """Return the tables as named columns, for a service's file."""

@@ -64,6 +64,9 @@ class Limits:
 LIMITS = Limits()
 """The limits of all commands, and the default of everything that takes limits."""
 
+SLOWEST_REPLAY = 1e-6
+"""Least speed of a replay, whose periods must fit 64 bits."""
+
 
 def read_json(data: bytes | memoryview, type_: type[_Type]) -> _Type:
     """Decode a JSON text that others wrote.

@@ -39,13 +39,13 @@ FILE = click.Path(path_type=Path)
 
 
 def seconds(text: str) -> float:
-    """Return a time in seconds, 0 or more and finite; for ``click.option(type=...)``."""
+    """Return a time in seconds, from 0 to 1e9 (30 years); for ``click.option(type=...)``."""
     try:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not 0 <= number < math.inf:
-        raise click.BadParameter(f"{text!r} is not a number of seconds.")
+    if not 0 <= number <= 1e9:
+        raise click.BadParameter(f"{text!r} is not a number of seconds from 0 to 1e9.")
     return number
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from skinware.cli import _command as cli
 from skinware.cli._terminal import are_terminals, echo, overwrite, print_json, say, terminal_width
 from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
+from skinware.limits import SLOWEST_REPLAY
 
 if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
@@ -41,7 +42,7 @@ class Terminal:
             b"\x1b[A": lambda: replayer.seek(replayer.time_s + 60),
             b"\x1b[B": lambda: replayer.seek(replayer.time_s - 60),
             b"+": lambda: replayer.speed(replayer.replay()["speed"] * 2),
-            b"-": lambda: replayer.speed(replayer.replay()["speed"] / 2),
+            b"-": lambda: replayer.speed(max(replayer.replay()["speed"] / 2, SLOWEST_REPLAY)),
             b"1": lambda: replayer.speed(1.0),
             b"l": lambda: replayer.loop(not replayer.replay()["loop"]),
             b"0": lambda: replayer.seek(0.0),

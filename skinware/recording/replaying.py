@@ -10,7 +10,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import Any
 
 from skinware.errors import BadRecording
-from skinware.limits import LIMITS
+from skinware.limits import LIMITS, SLOWEST_REPLAY
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.recording.reading import Recording
@@ -296,8 +296,8 @@ class Replayer:
     def speed(self, factor: float) -> dict[str, Any]:
         """Set the speed as a multiple of the recording's, and return what :meth:`replay` does."""
         factor = _number(factor, "factor")
-        if not factor > 0:
-            raise ValueError(f"factor={factor!r}: a speed is above 0; 1 is that of the recording")
+        if not factor >= SLOWEST_REPLAY:
+            raise ValueError(f"factor={factor!r}: a speed is at least {SLOWEST_REPLAY}; 1 is that of the recording")
         self._from_now(self.time_s)
         self._republisher.speed = factor
         return self.replay()

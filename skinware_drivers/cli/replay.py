@@ -14,6 +14,7 @@ import click
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.cli.replay import NAMESPACE, publish_again
+from skinware.limits import SLOWEST_REPLAY
 
 if TYPE_CHECKING:
     from skinware.recording import Recording
@@ -28,10 +29,10 @@ _PAYLOAD = 64
 
 
 def speed_text(text: str) -> float:
-    """Return a factor above 0; for ``click.option(type=...)``."""
+    """Return a factor; for ``click.option(type=...)``."""
     factor = cli.seconds(text)
-    if not factor:
-        raise click.BadParameter("a speed is above 0: 1 is the speed of the recording.")
+    if factor < SLOWEST_REPLAY:
+        raise click.BadParameter(f"a speed is at least {SLOWEST_REPLAY}: 1 is the speed of the recording.")
     return factor
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import msgspec
 
 from skinware.errors import BusNotAvailable, ConfigurationError
+from skinware.limits import SLOWEST_REPLAY
 from skinware.realtime import now_ns
 from skinware.wire import WireItem
 from skinware_drivers.bus import Bus, FrameBatch, chosen_by
@@ -48,12 +49,12 @@ class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     bus: Annotated[str, msgspec.Meta(description="name of the bus, if several were recorded")] = ""
     driver: Annotated[str, msgspec.Meta(description="driver of the bus, if several had it")] = ""
     speed: Annotated[
-        Annotated[float, msgspec.Meta(gt=0)] | Literal["max"],
+        Annotated[float, msgspec.Meta(ge=SLOWEST_REPLAY)] | Literal["max"],
         msgspec.Meta(description="2: twice as fast; max: as fast as the driver decodes, without losses"),
     ] = 1.0
-    start: Annotated[float, msgspec.Meta(description="where to begin, s since the recording began", ge=0)] = 0.0
+    start: Annotated[float, msgspec.Meta(description="where to begin, s since the recording began", ge=0, le=1e9)] = 0.0
     end: Annotated[
-        Annotated[float, msgspec.Meta(ge=0)] | None,
+        Annotated[float, msgspec.Meta(ge=0, le=1e9)] | None,
         msgspec.Meta(description="where to end, as start"),
     ] = None
 

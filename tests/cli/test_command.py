@@ -71,7 +71,7 @@ def test_an_error_that_nobody_expects_is_not_hidden() -> None:
         exit_status(command_that(ZeroDivisionError()), [])
 
 
-@pytest.mark.parametrize("text", ["nan", "inf", "-1", "soon", "1e400", ""])
+@pytest.mark.parametrize("text", ["nan", "inf", "-1", "soon", "1e300", ""])
 def test_a_time_must_be_a_time(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(command_that(), ["-T", text]) == 2
     assert "is not a number of seconds" in capsys.readouterr().err

@@ -325,7 +325,8 @@ def test_one_bus_of_several_and_part_of_the_time(tmp_path: Path, options: str, i
         ("", "which bus? there are: bus=can0&driver=other, bus=can0&driver=torso, bus=can1&driver=torso"),
         ("?bus=can0", "which bus? there are"),
         ("?bus=can7", "no bus can7; there are"),
-        ("?speed=0", "speed"),
+        ("?speed=1e-300", "speed"),
+        ("?start=1e300", "start"),
         ("?sped=2", "sped"),
     ],
 )

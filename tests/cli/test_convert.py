@@ -119,7 +119,10 @@ def test_an_interrupted_one_leaves_nothing(tmp_path: Path, format_name: str, num
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("format_name", sorted([*FORMATS, *LEARNING_FORMATS]))
-def test_no_room_is_one_line_and_leaves_nothing(file: Path, tmp_path: Path, format_name: str) -> None:
+def test_no_room_is_one_line_and_leaves_nothing(
+    file: Path, tmp_path: Path, format_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # or the limit cuts off the bytecode of what is imported
     done = subprocess.run(
         [BIN / "skin-convert", file, "--to", format_name, "-o", "out"],
         capture_output=True,

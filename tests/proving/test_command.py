@@ -202,8 +202,11 @@ def test_interrupted_while_it_tares_or_writes_it_ends_with_a_report(tmp_path: Pa
 
 
 @pytest.mark.thorough
-def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(tmp_path: Path) -> None:
+def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The checks so far are shown, even if the files cannot be written."""
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # or the limit cuts off the bytecode of what is imported
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         skin.values = STRUCTURE.sensor_uid * 0 + REST
         own = ("--json", "--rest", "0.5", "--wait", "60", "-o", str(tmp_path / "proof"))

@@ -26,14 +26,19 @@ WHOLE = ("TestBarrett", "TestAbilityHand", "TestArray", "TestTesollo", "TestFlex
 """Drivers for which a push runs the whole suite: CAN, serial with answers, Modbus, TCP, serial alone."""
 LONG = (
     "test_a_damaged_frame_costs_its_own_burst_only",
+    "test_a_dead_device_holds_up_no_other",
     "test_a_listener_sends_nothing",
+    "test_a_lost_bus_comes_back",
     "test_both_data_paths_do_the_same",
+    "test_devices_that_come_late_are_found",
+    "test_foreign_frames_disturb_nothing",
     "test_it_can_be_stopped_at_any_moment",
     "test_memory_does_not_grow",
     "test_no_run_of_lost_frames_tears_a_burst",
     "test_nothing_is_valid_before_the_first_data",
     "test_nothing_leaks",
     "test_nothing_torn_is_shown_while_a_sender_stumbles",
+    "test_silence_is_shown_and_ends",
 )
 """Tests of the suite that a push leaves out for the other drivers."""
 

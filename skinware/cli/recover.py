@@ -27,6 +27,7 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
     itself reads such files as they are.
     """
     from skinware.recording.files import recover
+    from skinware.text import plural
 
     target = output or file.with_name(f"{file.stem}.recovered.mcap")
     recovered = recover(file, target)
@@ -35,7 +36,8 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
         return
     for channel, count in recovered.messages.items():
         echo(f"{channel}: {count} messages")
-    what = "it was whole" if recovered.was_whole else f"{recovered.damaged} damaged chunks left out"
+    damage = f"{plural(recovered.damaged, 'damaged chunk')} left out" if recovered.damaged else "it was cut off"
+    what = "it was whole" if recovered.was_whole else damage
     echo(f"{target}: written; {what}")
 
 

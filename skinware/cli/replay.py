@@ -142,7 +142,8 @@ def publish_again(
             published = list(names or recording.services)
             ready: dict[str, Any] = {"event": "ready", "file": str(file), "namespace": place.name, "names": published}
             ready |= {"duration_s": recording.duration_s, "is_whole": recording.is_whole}
-            text = f"{file}, {recording.duration_s:.1f} s: {', '.join(published) or 'nothing'} in"
+            ends = "" if recording.is_whole else " (cut off or damaged)"
+            text = f"{file}, {recording.duration_s:.1f} s{ends}: {', '.join(published) or 'nothing'} in"
             say(as_json, ready, f"{text} namespace {place.name!r} (Ctrl-C ends)")
             if has_keys:
                 echo(KEYS)
@@ -175,9 +176,11 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
 
 
 def _report(event: str, replayer: Replayer, as_json: bool) -> None:
+    from skinware.text import plural
+
     with contextlib.suppress(BrokenPipeError):
         if as_json:
             print_json({"event": event, **replayer.replay(), "frames": dict(replayer.frames)})
         elif event == "stopped":
             late = f", {replayer.late} of them late" if replayer.late else ""
-            echo(f"{replayer.frames.total()} frames published{late}")
+            echo(f"{plural(replayer.frames.total(), 'frame')} published{late}")

@@ -114,6 +114,9 @@ def test_it_ends_with_the_recording(file: Path, capsys: pytest.CaptureFixture[st
     assert lines[-1].startswith("50 frames published")
     assert exit_status(replay, [str(file), "--start", "1000", "--loop"]) == 0  # there is nothing
     assert capsys.readouterr().out.splitlines()[-1] == "0 frames published"
+    file.write_bytes(file.read_bytes()[:-100])
+    assert exit_status(replay, [str(file), "--start", "1000"]) == 0
+    assert "s (cut off or damaged): torso in" in capsys.readouterr().out
 
 
 def test_without_a_namespace_it_stays_away_from_the_robot(

@@ -81,6 +81,7 @@ struct patch {
     double rate2;     /* its mean square */
     double unknown_s; /* how long too few taxels have been free to say how it moves */
     double known_s;
+    double noise2;    /* of a typical taxel */
     double drift;     /* variance that the offset of a taxel gains in a second by a drift of its own */
     double largest;   /* load of a touch, now or a moment ago */
     double since_s;   /* the last touch */

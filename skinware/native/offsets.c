@@ -47,7 +47,7 @@ static void step_mode(struct patch *p, double passed_s) {
 /* Which taxels are at rest, and what they say of the mode: a taxel near a contact may bear a load that is no touch. */
 static void sum_run(struct baseline *b, const struct run *run, struct patch *p) {
     const struct baseline a = *b; /* no store can change it */
-    const float common = (float)p->variance, low = -(float)b->off_sigma;
+    const float common = (float)p->variance, typical = (float)p->noise2, low = -(float)b->off_sigma;
     double weights = p->sums[WEIGHT], reach = p->sums[REACH], found = p->sums[FOUND], number = p->sums[FREE];
     const int64_t first = run->first, last = run->last;
     int64_t i;
@@ -63,7 +63,7 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
     INDEPENDENT
     for (i = first; i < last; i++) {
         const float on = a.on[i], hidden2 = a.held[i] ? on * on : 0.0f;
-        const float own = a.noise2[i] + a.variance[i];
+        const float own = highest(a.noise2[i], typical) + a.variance[i]; /* a dead taxel does not count for more */
         const float limit = 2.0f * sqrtf(own + a.gain[i] * a.gain[i] * common);
         const float weight = 1.0f / (own + hidden2), clipped = within(a.deviation[i], limit) * weight;
         a.scratch[i] = a.flag[i] ? weight : 0.0f;
@@ -105,7 +105,7 @@ void follow_common(struct baseline *b, double passed_s) {
     }
 }
 
-enum { NUMBER, BEYOND, NOISE2 };
+enum { NUMBER, BEYOND, TYPICAL };
 
 /* Adjusts what changes slowly: the drift of taxels by themselves, and the typical gain of a patch, which is 1. */
 static void tick(struct baseline *b, double passed_s) {
@@ -124,13 +124,17 @@ static void tick(struct baseline *b, double passed_s) {
             continue;
         p->sums[NUMBER] += 1;
         p->sums[BEYOND] += b->slow[i] * b->slow[i] > expected;
-        p->sums[NOISE2] += (double)b->noise2[i];
     }
+    medians(b, b->patch, b->n_patches, b->noise2, b->flag, &b->patches->sums[TYPICAL],
+            sizeof(struct patch) / sizeof(double));
     for (number = 0; number < b->n_patches; number++) {
         struct patch *p = &b->patches[number];
-        const double taxels = fmax(p->sums[NUMBER], 1), typical = p->sums[NOISE2] / taxels;
-        p->drift *= exp(b->tick_s / 10 * (2 * (p->sums[BEYOND] / taxels) - 1));
-        p->drift = fmin(fmax(p->drift, 1e-9 * typical), 1e-1 * typical);
+        const double beyond = p->sums[BEYOND] / fmax(p->sums[NUMBER], 1);
+        if (p->sums[NUMBER] > 0) {
+            p->noise2 = p->sums[TYPICAL];
+            p->drift *= exp(b->tick_s / 10 * (2 * beyond - 1));
+            p->drift = fmin(fmax(p->drift, 1e-9 * p->noise2), 1e-1 * p->noise2);
+        }
         p->sums[0] = p->sums[1] = 0;
     }
     for (i = 0; i < b->n; i++) {

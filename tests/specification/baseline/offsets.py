@@ -144,6 +144,7 @@ class Offsets:
         slow: (n,) float32, the deviation of each at rest, over some seconds.
         common: the common modes.
         agility: (n_patches,) variance that the offset of a taxel gains in a second by a drift of its own.
+        typical: (n_patches,) noise2 of a typical taxel: a dead one, without noise, says no more of the common mode.
     """
 
     def __init__(self, patch: Rows) -> None:
@@ -156,7 +157,7 @@ class Offsets:
         self.noise_s: Floats = np.full(n, NOISE_S, np.float32)
         self.patches = Grouping(patch)
         self.common = CommonMode(self.patches.n)
-        self.agility = np.zeros(self.patches.n)
+        self.agility, self.typical = np.zeros((2, self.patches.n))
         self._gain_before: Floats = self.gain.copy()
         self._grows: Floats = np.zeros(n, np.float32)
         """Variance that each offset gains in a second by a drift of its own."""
@@ -185,9 +186,9 @@ class Offsets:
         """
         if passed_s <= 0:
             return
-        total = self.total()
-        weight = np.where(free, np.float32(1) / (self.noise2 + self.variance + hidden2), np.float32(0))
-        limit = np.float32(2) * np.sqrt(total)
+        own = np.maximum(self.noise2, self.patches.spread(self.typical)) + self.variance
+        weight = np.where(free, np.float32(1) / (own + hidden2), np.float32(0))
+        limit = np.float32(2) * np.sqrt(own + self.gain * self.gain * self.patches.spread(self.common.variance))
         clipped = np.minimum(np.maximum(deviation, -limit), limit)
         np.copyto(clipped, 0, where=~free)
         weights = np.maximum(self.patches.sum(weight), 1e-30)
@@ -252,9 +253,11 @@ class Offsets:
         share = -math.expm1(-passed_s / SLOW_S)
         expected = np.float32(1.5 * _MEDIAN) * (self.noise2 * np.float32(share / (2 - share)) + self.uncertainty() ** 2)
         beyond = self.patches.sum(taxels & (self.slow * self.slow > expected)) / number
-        self.agility *= np.exp(self._tick_s / 10 * (2 * beyond - 1))
-        typical = self.patches.sum(np.where(taxels, self.noise2, np.float32(0))) / number
-        np.clip(self.agility, 1e-9 * typical, 1e-1 * typical, out=self.agility)
+        typical = self.patches.median(self.noise2, taxels).astype(np.float64)
+        some = self.patches.sum(taxels) > 0
+        np.copyto(self.typical, typical, where=some)
+        agility = self.agility * np.exp(self._tick_s / 10 * (2 * beyond - 1))
+        np.copyto(self.agility, np.clip(agility, 1e-9 * typical, 1e-1 * typical), where=some)
         self._grows[:] = self.patches.spread(self.agility)
         forgets = np.where(taxels, np.float32(-math.expm1(-self._tick_s / GAIN_LASTS_S)), np.float32(0))
         self.gain += (1 - self.gain) * forgets

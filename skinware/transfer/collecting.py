@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -15,6 +16,8 @@ from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns, short_turns
 from skinware.service._reader import Tap
 from skinware.wire import KIND, WISH, service_name
+
+log = logging.getLogger(__name__)
 
 _DISCOVERY_NS = NS_PER_S // 50
 """Between two looks for new services: a ring of 8 slots at 100 Hz loses nothing meanwhile."""
@@ -218,4 +221,5 @@ class Collector:
     def _report_trouble(self, name: str, text: str) -> None:
         if self._trouble.get(name) != text:
             self._trouble[name] = text
+            log.warning("%s%s", f"{name} is left out: " if name else "", text)
             self._report(UNREADABLE, name, why=text)

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 
 import skinware.recording
 from skinware import Namespace
-from skinware.errors import StructureError
+from skinware.errors import NamespaceError, StructureError
 from skinware.realtime import NS_PER_S
 from skinware.recording.files import Files, Past
 from skinware.recording.mcap_reading import McapSource
@@ -359,3 +359,14 @@ def test_a_real_full_disk(path: Path) -> None:
     with skinware.recording.open(path) as opened:
         assert opened.is_whole
         assert len(opened["torso"].read(["status"])) == stopped["messages"]["/skin/torso/frame"] > 0
+
+
+def test_a_namespace_that_may_not_be_read_is_said_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(_: Namespace) -> dict[str, int]:
+        raise NamespaceError("the folder may not be read")
+
+    monkeypatch.setattr(Namespace, "service_inodes", refuse)
+    Recorder(Files(tmp_path / "a.mcap")).run(0.1)
+    assert caplog.messages == ["the folder may not be read"]

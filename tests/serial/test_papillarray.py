@@ -160,7 +160,7 @@ def test_a_block_that_alone_is_no_longer_sent() -> None:
         async with Conformance().running(clock) as rig:
             await until_fresh(rig)
             rig.devices.silent.add("total")
-            await rig.sleep(2)
+            await rig.sleep(0.5)
             frame = rig.record.frames[-1]
             stale = np.flatnonzero(frame.status & Status.STALE)
             names = frame.structure.module_name[np.unique(frame.structure.sensor_module[stale])]
@@ -181,7 +181,7 @@ def test_what_is_sent_only_later(caplog: pytest.LogCaptureFixture) -> None:
             frame = await until_fresh(rig)
             assert frame.structure.n_sensors == 156
             rig.devices.silent.clear()
-            await rig.sleep(2)
+            await rig.sleep(0.5)
             assert not rig.counters()["unknown"]
 
     play(scenario)

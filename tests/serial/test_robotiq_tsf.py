@@ -74,10 +74,10 @@ def test_kinds_have_their_own_rates() -> None:
         case = type("Slow", (Conformance,), {"emulator_options": {"slow": 50}})()
         async with case.running(clock) as rig:
             await until_fresh(rig)
-            await rig.sleep(5)
+            await rig.sleep(3)
             assert not rig.record.frames[-1].status.any()
             rig.devices.silent.add("magnetometer1")
-            await rig.sleep(5)
+            await rig.sleep(3)
             frame = rig.record.frames[-1]
             stale = frame.structure.module_name[
                 np.unique(frame.structure.sensor_module[(frame.status & Status.STALE) != 0])

@@ -58,7 +58,7 @@ def shuffled(seed: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     return order // 12, order // 48
 
 
-@pytest.mark.parametrize("seed", [2, 3, 4, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (0, 1, 5))])
+@pytest.mark.parametrize("seed", [3, 4, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (0, 1, 2, 5))])
 def test_presses_losses_jumps_and_other_rates(seed: int) -> None:
     random = np.random.default_rng(seed)
     module, patch = shuffled(seed) if seed % 2 else (np.arange(N) // 12, np.arange(N) // 48)
@@ -172,7 +172,9 @@ def test_a_world_with_everything_that_goes_wrong() -> None:
 
 
 @pytest.mark.parametrize("is_first", [True, False])
-@pytest.mark.parametrize("later", range(4, 12))
+@pytest.mark.parametrize(
+    "later", [4, 7, 11, *(pytest.param(frames, marks=pytest.mark.thorough) for frames in (5, 6, 8, 9, 10))]
+)
 def test_a_module_that_is_looked_at_again_while_a_touch_begins_on_it(later: int, is_first: bool) -> None:
     both = Both(np.zeros(12, int), np.zeros(12, int))
     random = np.random.default_rng(later)

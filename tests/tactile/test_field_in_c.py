@@ -52,12 +52,12 @@ def test_grips_of_most_taxels(grip: float) -> None:
 
 
 def test_hands_that_are_covered_or_rest_at_first() -> None:
-    run(Turning("anyskin", seeds=1, until_s=23.0, covered=True))
-    run(Turning("xela", seeds=1, until_s=23.0, begin_s=12.0, speed=4.0))
+    run(Turning("anyskin", seeds=1, until_s=23.0, rate_hz=25.0, covered=True))
+    run(Turning("xela", seeds=1, until_s=23.0, rate_hz=25.0, begin_s=12.0, speed=4.0))
 
 
 def test_silence_of_a_second_and_of_minutes() -> None:
-    world = Turning("anyskin", seeds=1, until_s=8.0)
+    world = Turning("anyskin", seeds=1, until_s=8.0, rate_hz=25.0)
     both = run(world)
     for pause_s in (0.9, 1.5, 599.0, 601.0):
         run(world, both, begin_s=pause_s)

@@ -55,7 +55,7 @@ def test_all_that_a_page_can_ask_for(serving: Serve, recording: Path, namespace:
         page.pull_until(lambda _: page.replays[0]["speed"] == 0.25)
         page.pull_until(lambda _: not page.replays[0]["loop"])
         page.say("replay", action="speed", value=-1)
-        assert "above 0" in page.pull_until(lambda turn: "error" in turn)["error"]
+        assert "a speed is at least" in page.pull_until(lambda turn: "error" in turn)["error"]
         page.say("replay", action="resume")
         page.pull_until(lambda _: not page.replays[0]["paused"])
     with publishing(FakeSkin("torso", fake_structure(1, 2))), serving() as url, page_of(url) as page:

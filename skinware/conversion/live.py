@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Collection
 from threading import Event
@@ -20,6 +21,8 @@ from skinware.views.scene import Scene
 if TYPE_CHECKING:
     import foxglove
     import rerun
+
+log = logging.getLogger(__name__)
 
 _RAMP = "352b5c 40407f 3b5b8e 2f738e 23898e 22a085 44bb72 7fd150 c2df2c fde725"
 """Colours from the lowest to the highest level, those of the page."""
@@ -50,9 +53,13 @@ def stream(namespace: Namespace, names: Collection[str], sink: Sink, rate_hz: fl
     """
     calm = None if namespace.name == namespace.calm_name else Namespace(namespace.calm_name)
     follower, edition = Follower(Origin(namespace, tuple(names), calm)), 0
+    problem: str | None = None
     try:
         while not stop.wait(0.25 / rate_hz):
             newer = follower.take(round(NS_PER_S / rate_hz))
+            if follower.problem != problem:
+                problem = follower.problem
+                log.warning("%s", problem or "the drivers can be read now")
             if follower.edition != edition:
                 edition = follower.edition
                 sink.arrange(follower.scene, follower.drivers)

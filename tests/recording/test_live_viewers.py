@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from threading import Event
+from typing import Any, cast
 
 import numpy as np
+import pytest
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from rerun.chunk import RrdReader
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
+from skinware import Namespace
+from skinware.conversion.live import Sink, stream
+from skinware.errors import NamespaceError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, publishing
@@ -46,6 +51,23 @@ def test_rerun_has_places_values_and_states(tmp_path: Path) -> None:
     assert all(np.allclose(row, expected) for row in values)
     assert statuses == [[0] * len(expected)] * len(values)
     assert len({tuple(row) for row in found["Points3D:colors"]}) == 1
+
+
+def test_a_namespace_that_may_not_be_read_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    refusals = iter([NamespaceError("the folder may not be read")] * 2)
+    stop = Event()
+
+    def refuse(_: Namespace) -> dict[str, int]:
+        for error in refusals:
+            raise error
+        stop.set()
+        return {}
+
+    monkeypatch.setattr(Namespace, "service_inodes", refuse)
+    stream(Namespace(), (), cast(Sink, None), 1000.0, stop)
+    assert caplog.messages == ["the folder may not be read", "the drivers can be read now"]
 
 
 def _columns(file: Path) -> dict[str, list[Any]]:

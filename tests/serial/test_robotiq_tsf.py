@@ -97,7 +97,7 @@ def test_the_driver_never_starts_the_bootloader() -> None:
             assert isinstance(adapter, RobotiqTsfDriver)
             assert await adapter.version(link, ()) == "01.02.03"
             rig.devices.restart(0, clock.now_ns)
-            await rig.sleep(5)
+            await rig.sleep(2)
             await rig.stop()
         sent = [payload for _, payload in rig.wire.sent]
         assert {payload[2] for payload in sent} <= {0x58, 0xE3}

@@ -69,7 +69,7 @@ def test_taxels_that_never_send_and_patches_that_are_no_array() -> None:
     both, random = Both(patch), np.random.default_rng(2)
     usable = np.ones(16, bool)
     usable[[3, 10]] = False
-    for number in range(600):
+    for number in range(350):
         field = 30 * np.sin(number / 40 + np.arange(3))[:, None]
         values = (field + 5 * (number // 100) * (np.arange(16) == 8) + random.standard_normal((3, 16))).astype("f4")
         both.update(values, usable if number % 50 else np.zeros(16, bool), 0.02)

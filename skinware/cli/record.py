@@ -185,12 +185,14 @@ class _Progress:
         self._recorder, self._target, self._path, self._as_json = recorder, target, path, as_json
         self._begin_s = time.monotonic()
         self._before: dict[str, int] = {}
+        self._names: tuple[str, ...] = ()
+        self._namespace = ""
         self._is_past = False
         self._saved: list[Path] = []
 
     def ready(self, names: tuple[str, ...], namespace: str, *, is_past: bool) -> None:
         """Report the beginning of a recording of everything, or of the past only."""
-        self._is_past = is_past
+        self._names, self._namespace, self._is_past = names, namespace, is_past
         if self._as_json:
             print_json({"event": "ready", "file": str(self._path), "namespace": namespace, "names": list(names)})
         else:
@@ -236,6 +238,9 @@ class _Progress:
         """Report the end: everything that was taken is in the files, or else an error follows."""
         self._news()
         messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
+        absent = [name for name in self._names if not any(channel.split("/")[2:3] == [name] for channel in messages)]
+        if absent and not self._is_past:
+            cli.warn(f"{', '.join(absent)} did not appear in namespace {self._namespace!r}")
         if self._as_json:
             with contextlib.suppress(BrokenPipeError):
                 ends = {"file": (files or [""])[-1], "files": files, "is_complete": is_complete}

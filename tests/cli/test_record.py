@@ -85,11 +85,12 @@ def test_a_deleted_file_is_said_at_once(tmp_path: Path, namespace: Namespace) ->
 def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with publishing(FakeSkin("torso")):
-        assert exit_status(record, ["torso", "-T", "2.2"]) == 0
+        assert exit_status(record, ["torso", "tosro", "-T", "2.2"]) == 0
     (file,) = tmp_path.iterdir()
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert err == f"skin-record: tosro did not appear in namespace '{Namespace().name}'\n"
     assert out.startswith(
-        f"recording torso of namespace '{Namespace().name}' into {file.name} (Ctrl-C ends)\n00:00:01  "
+        f"recording torso, tosro of namespace '{Namespace().name}' into {file.name} (Ctrl-C ends)\n00:00:01  "
     )
     assert " MB, nothing missed\n" in out
     assert "/skin/torso/frame: " in out

@@ -256,9 +256,9 @@ class Health:
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
         far = np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
-        low, free = given < calm.baseline - far, calm.usable & ~calm.touched & (given <= calm.baseline + far)
+        free = calm.usable & ~calm.touched & (given <= calm.baseline + far)
         at_end = self._is_at_end(given)
-        if self._noise.add(self._now_s, given - self._use.value, at_end, low, free, calm):
+        if self._noise.add(self._now_s, given - self._use.value, at_end, free):
             self._clear = _CLEAR * self._typical_noise()
             self._dropouts.forget(self.settings.noise_s)
             shown = self._dues.share_shown(self.settings.touches)

@@ -14,8 +14,9 @@ from skinware.tactile.baseline import Calm
 from skinware.tactile.health_relations import APART_S, KEPT, Exchanges
 from skinware.tactile.neighbours import NONE, Table, pitch_m
 
-_ENOUGH_FRAMES = 100  # frames away from touches that a measurement of noise needs; with fewer it goes on
+_PARTS = 9  # of a measurement of noise
 _GROWTH = 1.2  # times: a noise grows by at most this from one measurement to the next
+_ENOUGH_FRAMES = 11  # frames away from touches that a part needs; with fewer it goes on
 _MODULE_APART_S = 5.0  # seconds: the same for a module, of which fingers touch one part after the other
 _MOST_AT_ONCE = 2048  # touched taxels that are compared in one frame; if there are more, each frame takes another part
 _NEAR_PITCHES = 1.3  # pitches: only the nearest ring of neighbours says much about the taxel in the middle
@@ -32,32 +33,28 @@ _EVEN = 1.4  # times: the farther of two opposite neighbours is at most this muc
 class Noise:
     """Measures the noise of n taxels again and again, by the differences from frame to frame.
 
-    A press nearby makes differences too, so a noise grows slowly. A release makes one as large as its load, if the
-    baseline was taken under that load (at the start, or by a tare): the taxel falls far below its baseline, which
-    follows it there soon. Differences in between do not count. ``deviation`` and ``at_end``, the share of the time at
-    an end of the range, are NaN before they are known.
+    A measurement has parts, and the noise is that of its median part: a press nearby makes differences only in some of
+    them, and so does the release of a load under which a baseline was taken. A noise grows slowly, as presses may be
+    in most of them. ``deviation`` and ``at_end``, the share of
+    the time at an end of the range, are NaN before they are known.
     """
 
     def __init__(self, n: int, measured_s: float) -> None:
         self.deviation: Floats = np.full(n, np.nan, np.float32)
         self.at_end: Floats = np.full(n, np.nan, np.float32)
-        self._measured_s = measured_s
-        self._begun_s = 0.0
+        self._part_s = measured_s / _PARTS
+        self._begun_s, self._ended = 0.0, 0
         self._was_free: Flags = np.zeros(n, bool)
         self._sums: Floats = np.zeros((3, n), np.float32)
-        """Sums of squared differences, of frames, and of frames at an end of the range."""
-        self._low: Flags = np.zeros(n, bool)
-        self._stays_low: Flags = np.zeros(n, bool)
-        """Taxels that were low before the last measurement ended: no baseline follows these."""
-        self._before_low: Floats = np.zeros((3, n), np.float32)  # the sums when each taxel fell
+        """Sums of squared differences, of frames, and of frames at an end of the range, of the present part."""
+        self._squares, self._ends = np.full((2, _PARTS, n), np.nan, np.float32)
+        self._n_parts: Whole = np.zeros(n, np.int64)
 
-    def add(self, now_s: float, difference: Floats, at_end: Flags, low: Flags, free: Flags, calm: Calm) -> bool:
+    def add(self, now_s: float, difference: Floats, at_end: Flags, free: Flags) -> bool:
         """Take in the difference from the frame before; return whether a measurement ends with it.
 
-        Taxels are low far below their baselines; those that are free are neither touched nor far above theirs, as at
-        the beginning of a touch.
+        Taxels are free that are neither touched nor far above their baselines, as at the beginning of a touch.
         """
-        self._note_low(low, calm)
         both = free & self._was_free
         self._was_free = free
         difference = np.where(both, difference, np.float32(0))
@@ -65,36 +62,26 @@ class Noise:
         squares += difference * difference
         frames += both
         ends += both & at_end
-        if now_s - self._begun_s < self._measured_s:
+        if now_s - self._begun_s < self._part_s:
             return False
         self._begun_s = now_s
-        self._conclude()
-        return True
+        self._end_parts()
+        self._ended += 1
+        return self._ended % _PARTS == 0
 
-    def _note_low(self, low: Flags, calm: Calm) -> None:
-        """Follow which taxels are low; drop the sums of those whose baselines have followed them meanwhile."""
-        changed = np.flatnonzero((low != self._low) & calm.usable)
-        if not len(changed):
-            return
-        fell = low[changed]
-        fallen, back = changed[fell], changed[~fell]
-        followed = back[calm.forced[back]]
-        self._before_low[:, fallen] = self._sums[:, fallen]
-        self._sums[:, followed] = self._before_low[:, followed]
-        self._low[changed] = fell
-        self._stays_low[back] = False
-
-    def _conclude(self) -> None:
-        """End a measurement. For taxels that fell only now, it ends before their fall."""
-        counted = np.where(self._low & ~self._stays_low, self._before_low, self._sums)
-        squares, frames, ends = counted
-        enough = frames >= _ENOUGH_FRAMES
-        noise = np.sqrt(squares[enough] / (2 * frames[enough]))
-        self.deviation[enough] = np.fmin(noise, _GROWTH * self.deviation[enough])
-        self.at_end[enough] = ends[enough] / frames[enough]
-        self._sums[:, enough] -= counted[:, enough]
-        self._before_low[:, enough] = 0
-        self._stays_low[:] = self._low
+    def _end_parts(self) -> None:
+        """End the parts that have frames enough; the others go on."""
+        squares, frames, ends = self._sums
+        enough = np.flatnonzero(frames >= _ENOUGH_FRAMES)
+        part = self._n_parts[enough] % _PARTS
+        self._squares[part, enough] = squares[enough] / (2 * frames[enough])
+        self._ends[part, enough] = ends[enough] / frames[enough]
+        self._sums[:, enough] = 0
+        self._n_parts[enough] += 1
+        known = enough[self._n_parts[enough] % _PARTS == 0]
+        noise = np.sqrt(np.partition(self._squares[:, known], _PARTS // 2, axis=0)[_PARTS // 2])
+        self.deviation[known] = np.fmin(noise, _GROWTH * self.deviation[known])
+        self.at_end[known] = self._ends[:, known].mean(axis=0)
 
 
 class Use:

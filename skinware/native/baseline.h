@@ -33,6 +33,7 @@
 #define BLOCKS 10             /* parts of calibrate_s: the median over ten survives a touch of a third of the time */
 #define BLOCK_FRAMES 4        /* values of a taxel in a part at least, as a variance of fewer says nothing */
 #define ENOUGH_BLOCKS 6       /* parts in which a taxel must have data */
+#define RESTLESS 100.0f       /* times the noise of the quietest part, squared: with more in half of them, the taxel moves */
 #define MOVED_SHARE 0.05      /* share of the taxels that may move; where more do, those that move have to wait */
 
 /* Drift, as it is learned */

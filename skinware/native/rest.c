@@ -169,6 +169,7 @@ static measured result_of(const struct baseline *b, int64_t taxel, float typical
     const float at_last = (float)b->patches[b->patch[taxel]].common;
     float sums[SUMS] = {0}, parts[BLOCKS], own[BLOCKS], both[BLOCKS], mode[BLOCKS], count[BLOCKS], d[BLOCKS], c[BLOCKS];
     float mean, power, prior, lowest_level = INFINITY, highest_level = -INFINITY;
+    float lowest_noise2 = INFINITY;
     measured found = {NAN, 0, 1, 0, 0};
     int64_t block, k = 0, i;
     for (block = b->n_blocks - BLOCKS; block < b->n_blocks; block++) {
@@ -193,6 +194,8 @@ static measured result_of(const struct baseline *b, int64_t taxel, float typical
     found.gain = 1 + (sums[DC] - mean * sums[D] - power) / (power + prior);
     for (i = 0; i < k; i++)
         parts[i] = (own[i] - 2 * found.gain * both[i] + found.gain * found.gain * mode[i]) / (count[i] - 1);
+    for (i = 0; i < k; i++)
+        lowest_noise2 = lowest(lowest_noise2, parts[i]);
     found.noise2 = median(parts, k) / typical;
     found.gain_variance = highest(found.noise2, 1e-12f) / (power + prior);
     found.noise2 = highest(found.noise2, 0);
@@ -202,7 +205,8 @@ static measured result_of(const struct baseline *b, int64_t taxel, float typical
         highest_level = highest(highest_level, parts[i]);
     }
     found.level = median(parts, k) + b->first[taxel] + found.gain * at_last;
-    found.moves = highest_level - lowest_level;
+    lowest_noise2 = highest(lowest_noise2, least_noise2(b, found.level));
+    found.moves = found.noise2 > RESTLESS * lowest_noise2 ? INFINITY : highest_level - lowest_level;
     return found;
 }
 

@@ -43,8 +43,11 @@ void hold_near(struct baseline *b, double passed_s) {
         b->is_near |= is_busy(b, k);
 }
 
-/* Finds the taxels at rest that are below their offsets by more than noise, unless most of their patch is. */
-static void find_low(struct baseline *b, float rustle_share) {
+/*
+ * Finds the taxels at rest that are below their offsets by more than noise. Where most of a patch is, that is its mode; but
+ * while it is touched only if its mode moves that much by itself: a cover can pull a whole patch down.
+ */
+static void find_low(struct baseline *b, float rustle_share, double passed_s) {
     const struct baseline a = *b; /* no store can change it */
     int64_t i, k, is_any = 0;
     INDEPENDENT
@@ -68,7 +71,9 @@ static void find_low(struct baseline *b, float rustle_share) {
     }
     for (k = 0; k < b->n_runs; k++) {
         const struct patch *p = &b->patches[b->runs[k].patch];
-        for (i = b->runs[k].first; p->sums[BELOW] > 0.5 * p->sums[RESTS] && i < b->runs[k].last; i++)
+        const int may_be = !is_busy(b, b->runs[k].patch) || p->agility * passed_s > p->noise2;
+        const int is_mode = may_be && p->sums[BELOW] > 0.5 * p->sums[RESTS];
+        for (i = b->runs[k].first; is_mode && i < b->runs[k].last; i++)
             a.below[i] = 0;
     }
 }
@@ -112,7 +117,7 @@ void follow_falls(struct baseline *b, float rustle_share, double passed_s) {
     int64_t i;
     if (a.is_signed)
         return;
-    find_low(b, rustle_share);
+    find_low(b, rustle_share, passed_s);
     find_sagging(b, (float)passed_s);
     for (i = 0; i < b->n; i++) {
         a.low[i] = a.live[i] & (a.smooth[i] < -a.on[i]);

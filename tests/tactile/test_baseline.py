@@ -594,3 +594,16 @@ def test_without_noise_a_taxel_says_no_more_of_the_drift_that_all_have_in_common
         values[:dead] = 2.5e6
         calm = baseline.update(number * NS_PER_S // 20, values)
         assert not calm.touched[dead:].any(), f"{number / 20} s"
+
+
+def test_a_hand_in_use_from_the_first_frame_takes_no_press_for_noise() -> None:
+    """A quarter of the taxels are pressed for 0.4 s of each 1.1 s: they wait until they are known at rest."""
+    random, n = np.random.default_rng(4), 40
+    baseline, module = Baseline(np.arange(n) // 8, np.zeros(n, int)), np.arange(n) < 10
+    for number in range(1200):
+        time_s = number / 50
+        load = 900 * np.sin(np.pi * min(time_s % 1.1, 0.4) / 0.4) * module * (time_s < 16)
+        calm = baseline.update(number * 20_000_000, np.round(12 + 0.3 * random.standard_normal(n) + load))
+    assert baseline.ready.all()
+    assert calm.noise.max() < 1
+    assert calm.baseline == pytest.approx(12, abs=1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skinware.tactile import Baseline
-from skinware.tactile.testing import Response, Wander, World, arm, arm_path, triangles
+from skinware.tactile.testing import Response, Wander, World, arm, arm_path, grid, triangles
 
 LOAD = 60
 
@@ -74,3 +74,17 @@ def test_fingers_that_stroke_without_end_leave_nothing_behind_them() -> None:
         seen, pressed = seen + int((calm.touched & is_pressed).sum()), pressed + int(is_pressed.sum())
     assert false / idle < 0.003
     assert seen / pressed > 0.97
+
+
+def test_a_cover_that_pulls_a_whole_quiet_patch_down_is_no_drift() -> None:
+    """Strokes over a plate whose cover sags all over it, where one step of the values is far more than noise."""
+    surface = grid(1, 8, 8)
+    world = World(surface, seed=2, rate_hz=20, noise=0.05, response=Response(width_m=0.004, sag=0.2))
+    ends = np.random.default_rng(2).uniform(surface.position_m.min(axis=0), surface.position_m.max(axis=0), (30, 2, 3))
+    for number, stroke in enumerate(ends):
+        world.stroke(stroke, 45.0, 7 + 3.0 * number, 9 + 3.0 * number, radius_m=0.006)
+    baseline = Baseline(surface.module, surface.patch)
+    for sample in world.samples(110.0):
+        calm = baseline.update(sample.time_ns, sample.values, sample.usable)
+    assert not calm.touched.any()
+    assert np.abs(calm.baseline - sample.values).max() <= 2

@@ -125,7 +125,7 @@ class SpecifiedBaseline:
         self._intake = _Intake(n, resolution)
         self._ready: Flags = np.zeros(n, bool)
         self._offsets = Offsets(patch)
-        self._rest = Rest(self._offsets.patches)
+        self._rest = Rest(self._offsets.patches, self._least_noise2)
         self._touches = Touches(module, patch, signed=signed)
         self._surroundings = Surroundings(module, patch)
         self._falls = Falls(self._surroundings)
@@ -241,7 +241,8 @@ class SpecifiedBaseline:
             self._let_go(over, live, on, off, deviation, passed_s)
         self._surroundings.hold(touches, live, passed_s, settings.settle_s)
         if not touches.signed:
-            self._falls.sag(touches.smooth, rustle, live & ~touches.touched, offsets.patches, passed_s)
+            moves = offsets.common.agility * passed_s > offsets.typical
+            self._falls.sag(touches.smooth, rustle, live & ~touches.touched, offsets.patches, moves, passed_s)
         low = self._recover(deviation, live, on, passed_s)
         if not self._all_held:
             floor: Floats | np.float32 = np.float32(min(passed_s / settings.tau_s, 0.5))

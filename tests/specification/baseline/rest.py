@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,14 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S
 from skinware.tactile.baseline import BaselineSettings
-from tests.specification.baseline.numbers import BLOCK_FRAMES, BLOCKS, ENOUGH_BLOCKS, GAIN_SPREAD2, MOVED_SHARE
+from tests.specification.baseline.numbers import (
+    BLOCK_FRAMES,
+    BLOCKS,
+    ENOUGH_BLOCKS,
+    GAIN_SPREAD2,
+    MOVED_SHARE,
+    RESTLESS,
+)
 from tests.specification.baseline.offsets import Grouping
 
 Floats = npt.NDArray[np.float32]
@@ -47,13 +55,15 @@ class Rest:
 
     Args:
         patches: the patches of the taxels.
+        least_noise2: returns the least noise2 of taxels at (k,) levels.
 
     Attributes:
         refused_share: share of the taxels that have to wait because they move.
         moves2: (n_patches,) by how much the common modes move from frame to frame, squared.
     """
 
-    def __init__(self, patches: Grouping) -> None:
+    def __init__(self, patches: Grouping, least_noise2: Callable[[Floats], Floats | np.float32]) -> None:
+        self._least_noise2 = least_noise2
         self.refused_share = 0.0
         self.moves2 = np.zeros(patches.n)
         self._patches = patches
@@ -153,11 +163,14 @@ class Rest:
         beside = np.nansum(dc, axis=0) - mean_c * np.nansum(d, axis=0) - power
         prior = noise2 / np.float32(GAIN_SPREAD2) + np.float32(1e-12)
         gain = (1 + beside / (power + prior)).astype(np.float32)
-        noise2 = _median((own - 2 * gain * both + gain * gain * mode) / (count - 1)) / np.float32(typical)
+        parts = (own - 2 * gain * both + gain * gain * mode) / (count - 1)
+        noise2 = _median(parts) / np.float32(typical)
         levels = (d - gain * c) / count
         level = _median(levels) + self._first[taxels] + gain * self._common[self._patches.group[taxels]]
         moves = np.nanmax(np.where(enough, levels, 0), axis=0) - np.nanmin(np.where(enough, levels, 0), axis=0)
         level = np.where(enough, level, np.float32(np.nan))
+        quietest = np.maximum(np.nanmin(np.where(enough, parts, 0), axis=0), self._least_noise2(level))
+        moves = np.where(noise2 > RESTLESS * quietest, np.float32(np.inf), moves)
         variance = np.maximum(noise2, 1e-12) / (power + prior)
         return (
             level,

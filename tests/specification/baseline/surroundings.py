@@ -101,11 +101,17 @@ class Falls:
         self.below: Flags = np.zeros(n, bool)
         self.sagging: Flags = np.zeros(n, bool)
 
-    def sag(self, smooth: Floats, rustle: Floats, rests: Flags, patches: Grouping, passed_s: float) -> None:
-        """Find the taxels at rest that are below their offsets by more than noise, unless most of their patch is."""
+    def sag(
+        self, smooth: Floats, rustle: Floats, rests: Flags, patches: Grouping, moves: Flags, passed_s: float
+    ) -> None:
+        """Find the taxels at rest that are below their offsets by more than noise, unless most of their patch is.
+
+        While a patch is touched, most of it may sag, unless its mode ``moves`` (n_patches,) by more than noise.
+        """
         below = rests & (smooth < np.where(self.below, np.float32(0), -rustle))
         if below.any():
             common = patches.sum(below) > 0.5 * patches.sum(rests)
+            common &= moves | (patches.sum(self._around.busy) == 0)
             if common.any():
                 below &= ~common[self._around.patch]
         self.below = below

@@ -78,6 +78,7 @@ class FakeSkin:
         self.why = why
         self.structure = structure or fake_structure()
         self.is_hung = False
+        self.acquired_ns: int | None = None
         self.values: npt.NDArray[Any] | None = None
         self.status = np.zeros(self.structure.n_sensors, np.uint8)
         self.untouched: npt.NDArray[np.uint8] | None = None
@@ -103,10 +104,10 @@ class FakeSkin:
             slots=slots,
         )
 
-    def publish(self, count: int = 1, acquired_ns: int | None = None) -> None:
-        """Publish frames; default: of now."""
+    def publish(self, count: int = 1) -> None:
+        """Publish frames of ``acquired_ns``; None: of now."""
         for _ in range(count):
-            time_ns = time.monotonic_ns() if acquired_ns is None else acquired_ns
+            time_ns = time.monotonic_ns() if self.acquired_ns is None else self.acquired_ns
             columns = self.writer.begin()
             columns["values"][:] = self._touched() if self.values is None else self.values
             columns["status"][:] = self.status

@@ -54,7 +54,8 @@ class Calmed:
             self.skin.values[RUSTLING] += self._random.integers(-20, 20)
             self.skin.values[AT_END] = rest[AT_END]
             self._time_ns += PERIOD_NS
-            self.skin.publish(acquired_ns=self._time_ns)
+            self.skin.acquired_ns = self._time_ns
+            self.skin.publish()
             self.chain.step(self._reader.read(), self._values, self.status)
             self.health.update(self._time_ns)
             self.health.mark(self.status)

@@ -305,7 +305,6 @@ def test_a_driver_that_is_paused_or_has_no_period_is_no_trouble() -> None:
     ("arguments", "words"),
     [
         (["a/b"], "driver name"),
-        ([], "Missing argument"),
         (["fake", "--into", "a b"], "namespace name"),
         (["fake", "--config", "/no/such.toml"], "/no/such.toml: No such file"),
         (["fake", "--into", "default", "--namespace", "default"], "give another with --into"),

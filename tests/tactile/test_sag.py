@@ -87,4 +87,4 @@ def test_a_cover_that_pulls_a_whole_quiet_patch_down_is_no_drift() -> None:
     for sample in world.samples(110.0):
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
     assert not calm.touched.any()
-    assert np.abs(calm.baseline - sample.values).max() <= 2
+    assert np.abs(calm.baseline - sample.values.astype(np.float32)).max() <= 2

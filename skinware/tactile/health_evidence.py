@@ -34,9 +34,9 @@ class Noise:
     """Measures the noise of n taxels again and again, by the differences from frame to frame.
 
     A measurement has parts, and the noise is that of its median part: a press nearby makes differences only in some of
-    them, and so does the release of a load under which a baseline was taken. A noise grows slowly, as presses may be
-    in most of them. ``deviation`` and ``at_end``, the share of
-    the time at an end of the range, are NaN before they are known.
+    them, and so does the release of a load under which a baseline was taken. A noise grows slowly, as presses may be in
+    most of them. ``deviation`` and ``at_end``, the share of the time at an end of the range, are NaN before they are
+    known.
     """
 
     def __init__(self, n: int, measured_s: float) -> None:

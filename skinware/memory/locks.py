@@ -122,8 +122,6 @@ class ProcessWatch(Descriptor):
         except (OSError, OverflowError):
             return
         else:
-            self._poll = select.poll()
-            self._poll.register(self.fd, select.POLLIN)
             start_ticks = _start_ticks(process.pid)
             if start_ticks and process.start_ticks and start_ticks != process.start_ticks:  # another has its number now
                 self.close()
@@ -132,7 +130,9 @@ class ProcessWatch(Descriptor):
     def has_ended(self) -> bool:
         """Return whether the process is known to have ended; False where that cannot be known, or once closed."""
         if self.fd >= 0:
-            return bool(self._poll.poll(0))
+            poll = select.poll()  # one for all threads would refuse the second of two at once
+            poll.register(self.fd, select.POLLIN)
+            return bool(poll.poll(0))
         return self._has_ended
 
     @property

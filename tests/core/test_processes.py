@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -76,3 +77,11 @@ print(has_ended(mine))
     if "unshare" in result.stderr:
         pytest.skip(result.stderr)
     assert result.stdout == "False\n", result.stderr
+
+
+def test_several_threads_may_ask_at_once() -> None:
+    watch = ProcessWatch(this_process())
+    with ThreadPoolExecutor(4) as threads:
+        answers = [threads.submit(lambda: [watch.has_ended() for _ in range(20_000)]) for _ in range(4)]
+        assert not any(any(each.result()) for each in answers)
+    watch.close()

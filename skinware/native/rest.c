@@ -192,10 +192,10 @@ static measured result_of(const struct baseline *b, int64_t taxel, float typical
     power = sums[CC] - mean * sums[C];
     prior = median(parts, k) / typical / GAIN_SPREAD2 + 1e-12f;
     found.gain = 1 + (sums[DC] - mean * sums[D] - power) / (power + prior);
-    for (i = 0; i < k; i++)
+    for (i = 0; i < k; i++) {
         parts[i] = (own[i] - 2 * found.gain * both[i] + found.gain * found.gain * mode[i]) / (count[i] - 1);
-    for (i = 0; i < k; i++)
         lowest_noise2 = lowest(lowest_noise2, parts[i]);
+    }
     found.noise2 = median(parts, k) / typical;
     found.gain_variance = highest(found.noise2, 1e-12f) / (power + prior);
     found.noise2 = highest(found.noise2, 0);

@@ -267,7 +267,7 @@ class Newest:
 
     def all_physical(self) -> npt.NDArray[np.float32]:
         """Return (n_sensors,) float32, values of the sensors of all types, each in its unit."""
-        return self.once("all", lambda: self.frame.physical_values())
+        return self.once("all", self.frame.physical_values)
 
     def above_baseline(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]] | None:
         """Return (n,) how far values are above their baselines, 0 without touch; None without a calmed driver."""

@@ -7,6 +7,7 @@ import fcntl
 import os
 import select
 import struct
+import threading
 import weakref
 from errno import EACCES, EAGAIN
 from typing import ClassVar, NamedTuple
@@ -70,15 +71,27 @@ class Descriptor(ForkGuard):
 
     def __init__(self, fd: int) -> None:
         self.fd = fd
+        self._in_use = threading.RLock()  # a number that is closed meanwhile may be another file's
         super().__init__()
 
-    def close(self) -> None:
-        """Close it, which also lets go of its lock. Idempotent."""
-        fd, self.fd = self.fd, -1
-        if fd >= 0:
-            os.close(fd)
+    def is_locked(self) -> bool:
+        """Return whether somebody else holds the exclusive lock on its file; False once closed."""
+        with self._in_use:
+            return self.fd >= 0 and is_locked(self.fd)
 
-    abandon = __del__ = close
+    def close(self) -> None:
+        """Close it once no other thread asks, which also lets go of its lock. Idempotent."""
+        with self._in_use:
+            fd, self.fd = self.fd, -1
+            if fd >= 0:
+                os.close(fd)
+
+    def abandon(self) -> None:
+        """Close it in a forked child, in which a thread that asked is no more."""
+        self._in_use = threading.RLock()
+        self.close()
+
+    __del__ = close
 
 
 UNKNOWN, ENDED = -1, -2
@@ -129,10 +142,11 @@ class ProcessWatch(Descriptor):
 
     def has_ended(self) -> bool:
         """Return whether the process is known to have ended; False where that cannot be known, or once closed."""
-        if self.fd >= 0:
-            poll = select.poll()  # one for all threads would refuse the second of two at once
-            poll.register(self.fd, select.POLLIN)
-            return bool(poll.poll(0))
+        with self._in_use:
+            if self.fd >= 0:
+                poll = select.poll()
+                poll.register(self.fd, select.POLLIN)
+                return bool(poll.poll(0))
         return self._has_ended
 
     @property

@@ -86,8 +86,7 @@ class Segment:
         Both are needed: a child that C forked keeps the lock of a dead parent, and a pid says nothing in another pid
         namespace.
         """
-        fd = self.descriptor.fd
-        return fd >= 0 and is_locked(fd) and not self.maker.has_ended()
+        return self.descriptor.is_locked() and not self.maker.has_ended()
 
     def close(self) -> None:
         """Close its descriptors, and let go of its lock; the map stays as long as its arrays. Idempotent."""

@@ -10,6 +10,7 @@ import shutil
 import signal
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -127,7 +128,7 @@ def fork_and_die() -> None:
         self.close()
 
     writer = ServiceWriter("x", COLUMNS)
-    Descriptor.abandon = abandon_slowly
+    mock.patch.object(Descriptor, "abandon", abandon_slowly).start()
     if os.fork() == 0:
         os._exit(0)
     assert not writer.closed

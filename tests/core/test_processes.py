@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from skinware.memory import locks
-from skinware.memory.locks import ENDED, UNKNOWN, Process, ProcessWatch, has_ended, this_process
+from skinware.memory.locks import ENDED, UNKNOWN, Descriptor, Process, ProcessWatch, has_ended, this_process
 
 
 def test_a_process_that_runs_has_not_ended() -> None:
@@ -60,6 +63,33 @@ def test_of_other_pid_namespaces_and_without_rights_nothing_is_known(monkeypatch
     assert not has_ended(ended._replace(start_ticks=0))
     monkeypatch.setattr(locks, "_start_ticks", lambda _: 0)  # hidepid
     assert not has_ended(ended)
+
+
+def test_nothing_is_closed_while_another_thread_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its number may be another file's the next moment."""
+    asked, answer, closed = threading.Event(), threading.Event(), threading.Event()
+
+    def slow_fcntl(fd: int, command: int, argument: bytes) -> bytes:
+        asked.set()
+        answer.wait()
+        os.fstat(fd)
+        return argument
+
+    def close() -> None:
+        descriptor.close()
+        closed.set()
+
+    monkeypatch.setattr(fcntl, "fcntl", slow_fcntl)
+    with ThreadPoolExecutor() as pool:
+        descriptor = Descriptor(os.open(tmp_path, os.O_RDONLY))
+        answers = pool.submit(descriptor.is_locked)
+        asked.wait()
+        pool.submit(close)
+        assert not closed.wait(0.05)
+        answer.set()
+        answers.result()
+        assert closed.wait(60)
+    assert (descriptor.fd, descriptor.is_locked()) == (-1, False)
 
 
 @pytest.mark.thorough

@@ -9,8 +9,8 @@ send every n ms, synchronous or not, ``E3`` version. ``E2`` starts the bootloade
 The check byte is 00 in the maker's program, which does not check it. By an older program (etienne-roberge/
 tactilesensors4, commit 0419b28 of 2021-01-11, ``Communication.h``) it is a CRC-8 of what is behind it, which that
 program does not compute either; its polynomial is not published. It is not looked at: a packet with data counts only
-if its fields fill it and the next one begins right behind it. Each field becomes a frame: its finger's time u32,
-values.
+if its fields fill it, and if it begins right behind another one or the next one begins right behind it. Each field
+becomes a frame: its finger's time u32, values.
 """
 
 from __future__ import annotations
@@ -96,6 +96,7 @@ class _Packets(Framer):
     def __init__(self, times: bool) -> None:
         super().__init__()
         self._times = times
+        self._followed = -1  # end of the last packet in the stream
 
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         found: list[Framed] = []
@@ -106,10 +107,13 @@ class _Packets(Framer):
             if len(stream) < at + _HEAD:
                 return found, at
             command, end = stream[at + 2], at + _HEAD + stream[at + 3]
-            needed = end + (_BEGINNING if command in _WITH_DATA else 0)
+            follows = self._before + at == self._followed
+            needed = end + (_BEGINNING if command in _WITH_DATA and not follows else 0)
             if command in _KNOWN and len(stream) < needed:
                 return found, at
             frames = self._frames(stream, at, end) if command in _KNOWN else None
+            if frames is not None and needed > end and (stream[end] != _START or stream[end + 2] not in _KNOWN):
+                frames = None
             if frames is None:
                 self.counters.refused += 1
                 self.counters.skipped_bytes += 1
@@ -118,6 +122,7 @@ class _Packets(Framer):
                 self.counters.frame_bytes += end - at
                 found += frames
                 done = end
+                self._followed = self._before + end
         self.counters.skipped_bytes += len(stream) - done
         return found, len(stream)
 
@@ -126,8 +131,6 @@ class _Packets(Framer):
         command, data, position = stream[at + 2], stream[at + _HEAD : end], self._before + end
         if command not in _WITH_DATA:
             return [Framed(_ANSWER | command, data, position)]
-        if stream[end] != _START or stream[end + 2] not in _KNOWN:
-            return None
         if not data:  # a command is confirmed
             return [Framed(_ANSWER | command, data, position)]
         fields = _fields(data)

@@ -44,6 +44,15 @@ def test_fields_of_a_packet_one_byte_at_a_time() -> None:
     assert counters.bytes_in == counters.frame_bytes + counters.skipped_bytes + framer.pending
 
 
+def test_a_packet_behind_another_one_waits_for_no_next_one() -> None:
+    framer = RobotiqPackets().framer()
+    assert not framer.feed(packet(TEMPERATURE))
+    for cut in (3, 6):
+        assert [frame.identifier for frame in framer.feed(packet(STATIC) + packet(TEMPERATURE)[:cut])][-1] == 0x411
+        assert [frame.identifier for frame in framer.feed(packet(TEMPERATURE)[cut:])] == [0x460]
+    assert framer.pending == 0
+
+
 @pytest.mark.parametrize(
     "bad",
     [

@@ -65,6 +65,8 @@ struct path {
     int64_t *of_group, *of_patch_ns; /* (n_groups,), (n_patches,) */
     struct chain updated_groups, patches;
     uint8_t *is_open, *was_open, *has_begun; /* (n_patches,) */
+    int64_t n_split;              /* frames in turn that held a long pause */
+    uint8_t *is_early;            /* (n_groups,) what came before it */
     int64_t left;                 /* publications of this take */
     int64_t living_ns;            /* as of when groups live, in this take */
 };

@@ -1,6 +1,8 @@
 /* When a frame is published, and what it says: running/publisher.py, tests/specification/publishing.py. */
 #include "inside.h"
 
+enum { SPLIT = 4 }; /* so many frames in turn that hold a long pause are no accident */
+
 int64_t path_time_ns(const struct path *path)
 {
     return path->words->fixed_ns ? path->words->fixed_ns : skinware__clock_ns(CLOCK_MONOTONIC);
@@ -177,6 +179,48 @@ static void update_patch_states(struct path *path, int64_t time_ns)
             plan->patch_state[patch] = (uint8_t)plan->state_stale;
 }
 
+/* Whether patches send together, and pause, and this complete frame ends before that pause; if not, `is_early`: the
+ * groups that came before the pause. */
+static void find_pause(struct path *path)
+{
+    const struct plan *plan = path->plan;
+    int64_t oldest_ns = INT64_MAX, newest_ns = INT64_MIN;
+    for (int64_t group = 0; group < plan->n_groups; group++) {
+        if (!plan->updated[group] || !plan->is_prompt[group])
+            continue;
+        if (plan->group_time_ns[group] < oldest_ns)
+            oldest_ns = plan->group_time_ns[group];
+        if (plan->group_time_ns[group] > newest_ns)
+            newest_ns = plan->group_time_ns[group];
+    }
+    if (newest_ns <= oldest_ns) {
+        path->n_split = 0;
+        return;
+    }
+    int64_t middle_ns = oldest_ns + (newest_ns - oldest_ns) / 2, begin_ns = oldest_ns, end_ns = newest_ns;
+    for (int64_t group = 0; group < plan->n_groups; group++) {
+        int64_t shown_ns = plan->group_time_ns[group];
+        bool is_new = plan->updated[group] && plan->is_prompt[group];
+        path->is_early[group] = is_new && shown_ns <= middle_ns;
+        if (path->is_early[group] && shown_ns > begin_ns)
+            begin_ns = shown_ns;
+        else if (is_new && shown_ns > middle_ns && shown_ns < end_ns)
+            end_ns = shown_ns;
+    }
+    path->n_split = end_ns - begin_ns > plan->period_ns / 8 * 5 ? path->n_split + 1 : 0;
+}
+
+/* Whether all has come that comes before the pause, so that the next frame can begin behind it. */
+static bool is_at_pause(const struct path *path)
+{
+    if (path->n_split < SPLIT || path->words->on_request)
+        return false;
+    for (int64_t group = 0; group < path->plan->n_groups; group++)
+        if (path->is_early[group] && !path->plan->updated[group])
+            return false;
+    return true;
+}
+
 /* After new data: publish a complete frame, or say when it will be due. */
 static void look_at_frame(struct path *path, int64_t time_ns)
 {
@@ -191,9 +235,13 @@ static void look_at_frame(struct path *path, int64_t time_ns)
         any_touched |= plan->touched[group];
         is_complete &= plan->touched[group] || !lives(path, group);
     }
-    if (any_updated && is_complete)
+    if (any_updated && is_complete) {
+        find_pause(path);
         publish(path);
-    else if (!path->words->due_ns && any_touched)
+    } else if (any_updated && is_at_pause(path)) {
+        path->n_split = 0;
+        publish(path);
+    } else if (!path->words->due_ns && any_touched)
         path->words->due_ns = time_ns + plan->patience_ns;
 }
 

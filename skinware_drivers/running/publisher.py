@@ -131,7 +131,9 @@ class Publisher:
 
     By cycle, a snapshot is published as soon as every live update group was heard (except groups that are slower than
     the driver), and always before a patch begins its next burst, so that no update is overwritten before publication
-    and no snapshot holds two bursts of a patch (``native/bursts.c``); else half a period after the cycle is over.
+    and no snapshot holds two bursts of a patch (``native/bursts.c``); else half a period after the cycle is over. Where
+    patches send together and then pause, snapshots end before the pause, whichever patch was heard first.
+
     Otherwise it is published at the driver's rate; without new values four times a second, so that readers see states.
 
     Args:

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, Phase, event, given, settings
 from hypothesis import strategies as st
 
 from skinware_drivers.description import Module, Patch, taxels
-from skinware_drivers.fields import Identifier
+from skinware_drivers.fields import Bits, Identifier
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.native.fuzzing import designs
@@ -114,6 +114,19 @@ def test_cycles(
 def test_values_and_flags(clock: HandClock, design: SkinDesign) -> None:
     with playing(clock, design, Publishing()) as player:
         player.play([event for value in range(24) for event in (Burst(value=value), Digest(), Pass())])
+
+
+def test_patches_that_send_together_are_shown_together(clock: HandClock) -> None:
+    layout = Layout([Frame("data", [Identifier(0x100, 0x7FC)], [1], Values(0, "u1", 1), patch=Bits(shift=0, width=2))])
+    patches = [Patch(str(key), [Module(taxels(1, first_uid=key))], key=key) for key in range(3)]
+    design = SkinDesign([BusDesign(layout, patches, 0.02)], "u1")
+    with Pair(clock, design.layouts, design.tables(), design.periods_s) as pair:
+        for period in range(8):
+            for key, pause_ms in ((2, 17), (0, 1), (1, 2)):
+                pair.feed([(0, clock.now_ns, 0x100 | key, bytes([period]))])
+                clock.now_ns += pause_ms * 1_000_000
+        assert pair.frames == 8
+        assert pair.numpy.frame(8)["values"].tolist() == [6, 6, 7]  # all of the last 3 ms
 
 
 def test_signaling_nans_stay_what_they_are(clock: HandClock) -> None:

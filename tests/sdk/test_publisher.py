@@ -167,6 +167,20 @@ def test_a_missing_board_holds_nothing_up_for_long(monkeypatch: pytest.MonkeyPat
     desk.close()
 
 
+def test_boards_that_send_together_are_shown_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever was heard first, a frame ends before the pause, not behind it."""
+    desk = Desk(monkeypatch, (7, 9))
+    for period in range(10):
+        for board, pause_ms in ((9, 45), (7, 5)):
+            desk.feed(desk.burst(period, board=board))
+            desk.clock.now_ns += pause_ms * MS
+    frames = [desk.reader._ring.copy(sequence) for sequence in range(1, desk.writer.sequence + 1)]
+    shown = [(np.ptp(frame.module_time_ns) > 40 * MS, set(frame.values.tolist())) for frame in frames if frame]
+    assert shown[:2] == [(True, {2}), (True, {3})]
+    assert shown[2:] == [(False, {value - 1, value}) for value in range(4, 10)]  # without a period left out
+    desk.close()
+
+
 def test_what_arrived_and_was_not_taken_yet_may_belong_to_the_burst(monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver that was held up between its take and its look at the clock would cut all bursts from then on."""
     desk = Desk(monkeypatch)

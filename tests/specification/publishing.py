@@ -15,6 +15,7 @@ from skinware_drivers.running.publisher import NEVER_NS, PatchTiming, Publisher
 from tests.specification.bursts import Bursts
 from tests.specification.decoding import SpecifiedState
 
+_SPLIT = 4
 _STALE = np.uint8(Status.STALE)
 _LIVE, _NOW_STALE = np.uint8(PatchState.LIVE), np.uint8(PatchState.STALE)
 
@@ -30,6 +31,8 @@ class SpecifiedPublisher(Publisher):
         self.bursts = Bursts(self.state, self.patches, self.pace, self._show, self._skip)
         self._group_module = self._structure.group_module.astype(np.intp)
         self._sensor_group = self._structure.sensor_group.astype(np.intp)
+        self._n_split = 0  # frames in turn that held a long pause
+        self._is_early = np.zeros(self._structure.n_groups, bool)  # what came before it
         self._due_ns = 0
         self._not_before_ns = 0  # a burst that has begun holds up the snapshot until then
         self._last_published_ns = now_ns()
@@ -148,9 +151,30 @@ class SpecifiedPublisher(Publisher):
         if self.bursts.holds_back:
             self._due_ns = time_ns + self.pace.pause_ns
         elif state.updated.any() and (state.touched | ~self._living(time_ns)).all():
+            self._find_pause()
+            self.publish()
+        elif state.updated.any() and self._is_at_pause():
+            self._n_split = 0
             self.publish()
         elif not self._due_ns and state.touched.any():
             self._due_ns = time_ns + self.pace.patience_ns
+
+    def _find_pause(self) -> None:
+        """Find the pause of patches that send together, if a complete frame does not end before it."""
+        is_new, times_ns = self.state.updated & self.state.is_prompt, self.state.group_time_ns
+        new_ns = np.unique(times_ns[is_new])
+        if len(new_ns) < 2:
+            self._n_split = 0
+            return
+        middle_ns = new_ns[0] + (new_ns[-1] - new_ns[0]) // 2
+        self._is_early = is_new & (times_ns <= middle_ns)
+        pause_ns = new_ns[new_ns > middle_ns][0] - new_ns[new_ns <= middle_ns][-1]
+        self._n_split = self._n_split + 1 if pause_ns > self.pace.period_ns // 8 * 5 else 0
+
+    def _is_at_pause(self) -> bool:
+        """Return whether all has come that comes before the pause, so that the next frame can begin behind it."""
+        is_split = self._n_split >= _SPLIT and not self.on_request
+        return is_split and bool(self.state.updated[self._is_early].all())
 
     def _hear(self, updates: Updates, time_ns: int) -> None:
         """Note which groups live. Of a patch that begins to send, all: its first burst is not over after one."""

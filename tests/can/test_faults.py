@@ -305,6 +305,7 @@ def test_the_kernel_tells_of_its_controllers(can_pair: tuple[str, str], vcan: Ca
     ip("link", "set", can_pair[0], "type", "can", "restart-ms", "0")
 
 
+@pytest.mark.usefixtures("vcan")
 def test_an_adapter_of_the_slcan_line_discipline_that_is_unplugged() -> None:
     """What slcand does, on a pty."""
     ours, theirs = os.openpty()

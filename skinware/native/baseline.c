@@ -10,9 +10,6 @@ enum { REST, HELD, RELEARNING, COVERED, DOUBTED, SATURATED, NO_RESOLUTION }; /* 
 enum { NO_VALUE = -1, NO_NOISE = -2 }; /* of a tare */
 
 SKINWARE_EXPORT void skinware_baseline_begin(struct baseline *b);
-SKINWARE_EXPORT void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *values,
-                                              const uint8_t *usable, const uint8_t *jumped, const uint8_t *bears,
-                                              float *to);
 SKINWARE_EXPORT int64_t skinware_baseline_tare(struct baseline *b, int64_t patch);
 SKINWARE_EXPORT void skinware_baseline_lose_common(struct baseline *b);
 
@@ -138,6 +135,7 @@ static void show(struct baseline *b, float *to) {
     uint8_t *touched = (uint8_t *)(to + 4 * n), *held = touched + n, *why = held + n, *forced = why + n;
     uint8_t *const flag = a.flag;
     const uint8_t few_levels = (uint8_t)(a.few_levels != 0), is_held = (uint8_t)(a.is_held != 0);
+    uint8_t doubts = 0;
     const float other_side = a.is_signed ? -1.0f : 1.0f, lowest_shown = a.is_signed ? -INFINITY : 0.0f;
     int64_t number, i;
     for (number = 0; number < b->n_runs; number++) {
@@ -179,6 +177,9 @@ static void show(struct baseline *b, float *to) {
         reason = (a.touched[i] & a.at_end[i]) ? SATURATED : reason;
         why[i] = (few_levels & a.live[i]) ? NO_RESOLUTION : reason;
     }
+    for (i = 0; i < n; i++)
+        doubts |= why[i] == DOUBTED;
+    b->doubts = doubts;
     memcpy(forced, b->forced, (size_t)n);
     memset(b->forced, 0, (size_t)n);
     memcpy(forced + n, b->live, (size_t)n);

@@ -117,6 +117,7 @@ struct baseline {
     int64_t *patch, *module;
 
     int64_t time_ns, has_time, few_levels, is_near, all_ready;
+    int64_t doubts; /* 1: a touch seems to lower some of them in the newest frame */
     double tick_s, refused_share;
     int64_t block_ns, block_frames, n_blocks; /* the tenth that is being measured, and how many are over */
 
@@ -162,6 +163,9 @@ static inline float load_of(const struct baseline *b, float deviation) {
 }
 
 /* baseline.c */
+SKINWARE_EXPORT void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *values,
+                                              const uint8_t *usable, const uint8_t *jumped, const uint8_t *bears,
+                                              float *to);
 double least_on(const struct baseline *b);
 float least_noise2(const struct baseline *b, float level);
 void put(struct baseline *b, int64_t taxel, float by);

@@ -102,7 +102,9 @@ class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 _STRUCTS = read_structs([Path(native.__file__).with_name("baseline.h")])
-_BLOCKS, _SHOWN = 60, 21  # numbers of a taxel that is measured, and bytes of a taxel that is shown
+_BLOCKS = 60  # numbers of a taxel that is measured
+SHOWN = 21
+"""Bytes of a taxel that the library shows."""
 _WHERE_NONE = {"minimum_on": math.nan, "maximum_hold_s": math.inf}
 _NO_VALUE, _NO_NOISE = -1, -2
 _LEARNED = (
@@ -148,6 +150,24 @@ class Calm:
     forced: Flags
     usable: Flags
 
+    @classmethod
+    def of(cls, memory: Bytes) -> Self:
+        """Return the arrays in (n * SHOWN,) bytes as the library writes them."""
+        n = len(memory) // SHOWN
+        values_of = memory[: 16 * n].view(np.float32).reshape(4, n)
+        flags_of = memory[16 * n :].view(np.bool_).reshape(5, n)
+        return cls(
+            value=values_of[0],
+            touched=flags_of[0],
+            held=flags_of[1],
+            baseline=values_of[1],
+            uncertainty=values_of[2],
+            noise=values_of[3],
+            why=memory[18 * n : 19 * n],
+            forced=flags_of[3],
+            usable=flags_of[4],
+        )
+
 
 class _Given:
     """Memory at one address that (n,) arrays are copied to for C, as finding the address of each takes longer."""
@@ -182,6 +202,7 @@ class Baseline:
 
     Attributes:
         type_name: the sensor type, where it was made for one.
+        at: address of its ``struct baseline``, for C.
     """
 
     def __init__(
@@ -216,10 +237,10 @@ class Baseline:
             "modules": np.zeros((n_modules, ctypes.sizeof(_STRUCTS["Module"]) // 8)),
         }
         self._arrays = give_arrays(words, n, room, given)
-        self._at = ctypes.addressof(words)
+        self.at: int = ctypes.addressof(words)
         self._given = [_Given(n, dtype) for dtype in (np.float32, np.bool_, np.bool_, np.bool_)]
         self.settings = settings or BaselineSettings()
-        _begin(self._at)
+        _begin(self.at)
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, settings: BaselineSettings | None = None) -> Self:
@@ -252,6 +273,11 @@ class Baseline:
         return float(self._words.refused_share)
 
     @property
+    def doubts(self) -> bool:
+        """Whether a touch seems to lower some taxels in the newest frame."""
+        return bool(self._words.doubts)
+
+    @property
     def settings(self) -> BaselineSettings:
         """The settings; new ones hold from the next frame on."""
         return self._settings
@@ -279,7 +305,7 @@ class Baseline:
         Raises:
             ConfigurationError: too few values have come yet.
         """
-        number = int(_tare(self._at, -1 if patch is None else patch))
+        number = int(_tare(self.at, -1 if patch is None else patch))
         if number == _NO_VALUE:
             raise ConfigurationError("nothing to tare: no value has come yet")
         if number == _NO_NOISE:
@@ -313,22 +339,10 @@ class Baseline:
             jumped: (n,) bool, where the hardware moved its own baseline just before this frame; default: nowhere.
             bears: (n,) bool, where the vector of which a value is an axis bears a load; default: nowhere.
         """
-        n, memory = self._n, np.empty(_SHOWN * self._n, np.uint8)
+        memory = np.empty(SHOWN * self._n, np.uint8)
         at = [given.take(of) for given, of in zip(self._given, (values, usable, jumped, bears), strict=True)]
-        _update(self._at, time_ns, *at, memory.ctypes.data)
-        values_of = memory[: 16 * n].view(np.float32).reshape(4, n)
-        flags_of = memory[16 * n :].view(np.bool_).reshape(5, n)
-        return Calm(
-            value=values_of[0],
-            touched=flags_of[0],
-            held=flags_of[1],
-            baseline=values_of[1],
-            uncertainty=values_of[2],
-            noise=values_of[3],
-            why=memory[18 * n : 19 * n],
-            forced=flags_of[3],
-            usable=flags_of[4],
-        )
+        _update(self.at, time_ns, *at, memory.ctypes.data)
+        return Calm.of(memory)
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return all that was learned, by name: arrays (n,), copies."""
@@ -349,5 +363,5 @@ class Baseline:
             here[here] = np.isfinite(state[name][rows[here]])
         for name, array in learned.items():
             array[here] = state[name][rows[here]]
-        _lose_common(self._at)
+        _lose_common(self.at)
         return int(here.sum())

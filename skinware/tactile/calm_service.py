@@ -152,7 +152,7 @@ class CalmService:
         self._source = DriverSource(name, self.namespace)
         self._calmed = CalmedDriver(name, self.into, group, self._requests.operations)
         self._state: Literal["waiting", "running", "lost"] = "waiting"
-        self._warned: set[str] = set()
+        self._warned: set[tuple[str, str]] = set()
         self._stopping = False
 
     def run(
@@ -250,7 +250,7 @@ class CalmService:
         chain.explain(columns["uncertainty"], columns["why"])
         self.health.mark(columns["status"])
         writer.commit(frame.acquired_ns)
-        self.contacts.publish(columns["values"], columns["status"], frame.acquired_ns)
+        self.contacts.publish(frame.acquired_ns)
         self.motion.publish(frame.acquired_ns)
         self.health.update(frame.acquired_ns)  # after all that programs wait for
         self._warn(chain)
@@ -266,14 +266,16 @@ class CalmService:
         self._state = "lost"
         self._calmed.publish_stale()
         time_ns = now_ns()
-        self.contacts.publish_none(time_ns)
+        assert self.chain is not None  # noqa: S101 - there was a frame
+        self.chain.lose()
+        self.contacts.publish(time_ns)
         self.motion.publish(time_ns)
 
     def _warn(self, chain: Chain) -> None:
         """Warn once of the sensors of each type that wait for their baselines, and that a touch seems to lower."""
         for name, stage in chain.baseline_stages.items():
-            share, calm = stage.baseline.refused_share, stage.calm
-            if self._is_new(f"{name} moves", share > 0):
+            share = stage.baseline.refused_share
+            if self._is_new((name, "moves"), share > 0):
                 log.warning(
                     "%s: no baselines yet for %.0f %% of the sensors: they move; each gets one when it has rested for"
                     " %g s, or at a tare",
@@ -281,16 +283,15 @@ class CalmService:
                     100 * share,
                     stage.baseline.settings.calibrate_s,
                 )
-            doubted = 0 if calm is None else int(np.count_nonzero(calm.why == Why.DOUBTED))
-            if self._is_new(f"{name} doubted", doubted > 0):
+            if self._is_new((name, "doubted"), stage.baseline.doubts):
                 log.warning(
                     "%s: sensors fall and return where nothing touches (%d so far): if a touch lowers them, put a stage"
                     " amplifier with gain -1 before the baseline",
                     name,
-                    doubted,
+                    np.count_nonzero(stage.shown.why == Why.DOUBTED),
                 )
 
-    def _is_new(self, what: str, is_there: bool) -> bool:
+    def _is_new(self, what: tuple[str, str], is_there: bool) -> bool:
         is_new = is_there and what not in self._warned
         (self._warned.add if is_there else self._warned.discard)(what)
         return is_new

@@ -5,6 +5,7 @@ docs/tactile/baselines.md has examples of the file; the keys of a stage are its 
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,17 +15,32 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from skinware import native
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.status import Status
+from skinware.native import give_arrays
 from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
-from skinware.tactile.baseline import UNUSABLE, Baseline, BaselineSettings, Calm
+from skinware.tactile.baseline import SHOWN, UNUSABLE, Baseline, BaselineSettings, Calm
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
-from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
+from skinware.tactile.stages import (
+    STRUCTS,
+    AmplifierSettings,
+    FilterSettings,
+    ScalerSettings,
+    Signal,
+    Stage,
+    Taxels,
+)
 from skinware.tactile.thermal import ThermalSettings
 from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of
 from skinware.toml_text import TomlText
+
+_calls = native.core().quick
+_begin, _end, _calm = _calls.skinware_chain_begin, _calls.skinware_chain_end, _calls.skinware_chain_calm
+for _call in (_begin, _end):
+    _call.argtypes, _call.restype = (ctypes.c_void_p,), None
+_calm.argtypes, _calm.restype = (*(ctypes.c_void_p,) * 2, ctypes.c_int64, *(ctypes.c_void_p,) * 2), None
 
 RESTLESS = (TEMPERATURE, "acceleration_", "angular_rate_")
 """Beginnings of the names of types that have no rest to go back to."""
@@ -57,8 +73,9 @@ class BaselineStage(Stage):
     Attributes:
         baseline: the baselines.
         before: the taxels as they come in.
-        given: (n,) float32, the values of the newest frame as they came in.
-        calm: the same, calmed; None before the first frame.
+        given: (n,) float32, the values of the newest frame as they came in; the next one overwrites them.
+        shown: the same, calmed, in arrays that the next frame overwrites.
+        calm: ``shown``; None before the first frame.
     """
 
     name = "baseline"
@@ -80,6 +97,9 @@ class BaselineStage(Stage):
         )
         self.given: Floats = np.full(len(taxels), np.nan, np.float32)
         self.calm: Calm | None = None
+        memory = np.zeros(SHOWN * len(taxels), np.uint8)
+        self.shown = Calm.of(memory)
+        self._to = self.given.ctypes.data, memory.ctypes.data
 
     @property
     def touched(self) -> Flags:
@@ -87,14 +107,8 @@ class BaselineStage(Stage):
         return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
 
     def step(self, signal: Signal) -> None:
-        self.given = signal.values
-        self.calm = calm = self.baseline.update(
-            signal.time_ns, signal.values, signal.usable, jumped=signal.jumped, bears=signal.bears
-        )
-        signal.deviation = signal.values - calm.baseline
-        signal.values = calm.value
-        signal.forced |= calm.forced
-        signal.unknown |= np.isnan(calm.baseline)
+        _calm(self.baseline.at, signal.at, signal.time_ns, *self._to)
+        self.calm = self.shown
 
 
 FORMAT, VERSION = "skinware-chain", 1
@@ -226,13 +240,14 @@ class Chain:
         structure: structure of the output: the same sensors, float32, with the units of the last stages.
         stages: by type.
         baseline_stages, curve_stages: by type, the first stage that is a baseline, and the last that is a curve.
+        values, status: (n_sensors,) float32 and uint8, the output of the newest frame; the next one overwrites it.
+        at: address of its ``struct chain``, for C.
         vectors: the types that are axes of vectors, for each stage that shows vectors.
     """
 
     def __init__(
         self, structure: Structure, steps: list[tuple[Stage, tuple[str, ...]]], taxels: dict[str, Taxels]
     ) -> None:
-        self._steps = steps
         self.stages = {name: [stage for stage, names in steps if name in names] for name in taxels}
         self.baseline_stages: dict[str, BaselineStage] = {}
         self.curve_stages: dict[str, CurveStage] = {}
@@ -250,8 +265,17 @@ class Chain:
                     self.keep(name, stage, f"{name}/", f"{stage.name}.")
         self.vectors = [names for stage, names in steps if isinstance(stage, VectorStage)]
         self._before = structure
-        self._staged = {name: structure.span(name) for name, stages in self.stages.items() if stages}
-        self._suspect: Flags | None = None
+        self._signals = {name: Signal(structure.index(name)) for name, stages in self.stages.items() if stages}
+        self._steps = [(stage, [self._signals[name] for name in names]) for stage, names in steps]
+        self._warm = [stage for stage in self.curve_stages.values() if stage.table.warms]
+        self.values: Floats = np.zeros(structure.n_sensors, np.float32)
+        self.status: Bytes = np.zeros(structure.n_sensors, np.uint8)
+        signals = np.array([signal.at for signal in self._signals.values()], np.uint64)
+        self._kept = words, _ = STRUCTS["Chain"](), signals
+        given: Arrays = {"values": self.values, "status": self.status, "signals": signals}
+        words.n, words.n_signals = structure.n_sensors, len(signals)
+        give_arrays(words, 0, {}, given)
+        self.at: int = ctypes.addressof(words)
         types = [replace(taxels[t.name].type, scale=1.0, offset=0.0) for t in structure.types]
         self.structure: Structure = structure.replace(types=types, dtype=np.float32)
 
@@ -316,32 +340,27 @@ class Chain:
         Fills (n_sensors,) float32 values with the output; and (n_sensors,) uint8 status with that of the frame,
         ``SUSPECT`` where a baseline was moved by force, and ``NEVER_SEEN`` where a stage has no result yet.
         """
-        status[:] = frame.status
-        if any(stage.table.warms for stage in self.curve_stages.values()):
+        if self._warm:
             temperature_c = temperature_of(frame)
-            for curve in self.curve_stages.values():
+            for curve in self._warm:
                 curve.temperature_c = temperature_c
-        given = frame.physical_values()
-        usable = ((status & UNUSABLE) == 0) & np.isfinite(given)
-        suspect = (status & Status.SUSPECT) != 0
-        jumped = np.zeros_like(suspect) if self._suspect is None else suspect & ~self._suspect
-        self._suspect = suspect
-        forced, unknown = np.zeros((2, len(given)), bool)
-        signals = {
-            name: Signal(frame.acquired_ns, given[at], usable[at], jumped[at], forced[at], unknown[at], given[at])
-            for name, at in self._staged.items()
-        }
-        for stage, names in self._steps:
-            stage.step(*(signals[name] for name in names))
-        values[:] = given
-        for name, at in self._staged.items():
-            signal = signals[name]
-            values[at], forced[at], unknown[at] = signal.values, signal.forced, signal.unknown
-        status |= forced * np.uint8(Status.SUSPECT) | unknown * np.uint8(Status.NEVER_SEEN)
+        self.values[:], self.status[:] = frame.physical_values(), frame.status
+        _begin(self.at)
+        time_ns = frame.acquired_ns
+        for signal in self._signals.values():
+            signal.time_ns = time_ns
+        for stage, signals in self._steps:
+            stage.step(*signals)
+        _end(self.at)
+        values[:], status[:] = self.values, self.status
+
+    def lose(self) -> None:
+        """Let the output be that of a dead driver: nothing is known, and nothing touches."""
+        self.values[:], self.status[:] = 0, UNUSABLE
 
     def explain(self, uncertainty: Floats, why: Bytes) -> None:
         """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""
         for name, stage in self.baseline_stages.items():
             if stage.calm is not None:
-                index = self._before.index(name)
-                uncertainty[index], why[index] = stage.calm.uncertainty, stage.calm.why
+                at = self._before.span(name)
+                uncertainty[at], why[at] = stage.calm.uncertainty, stage.calm.why

@@ -252,7 +252,7 @@ class Contacts:
             value: (n,) calmed values: 0 = no touch. Values below 0 or not finite count as 0.
             touched: (n,) bool, which taxels are touched.
             time_ns: when the frame was acquired, CLOCK_MONOTONIC ns.
-            onset: (n,) bool, which taxels :class:`.Onsets` finds: contacts of these alone are provisional.
+            onset: (n,) bool, which taxels rose in the last frames: contacts of these alone are provisional.
             clipped: (n,) bool, which values are at the end of their range.
             uncertainty: (n,) how much of each value could be noise or drift.
             sigmas: (n,) by how many standard deviations of its noise each is above its baseline; NaN: not known. No

@@ -242,9 +242,9 @@ class CurveStage(Stage):
         self.error: Floats = np.full(len(taxels), np.nan, np.float32)
 
     def step(self, signal: Signal) -> None:
-        given = signal.values
-        signal.values = self.table.step(given, self._passed_s(signal), self.temperature_c)
-        self.error = self.table.error(given, signal.values)
+        found = self.table.step(signal.values, self._passed_s(signal), self.temperature_c)
+        self.error = self.table.error(signal.values, found)
+        signal.values[:] = found
 
 
 def temperature_of(frame: DriverSnapshot) -> float:

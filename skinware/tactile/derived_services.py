@@ -6,6 +6,7 @@ from every frame, and gives itself up on an error, as calm values are worth more
 
 from __future__ import annotations
 
+import ctypes
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -15,25 +16,30 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from skinware import native
 from skinware.errors import ConfigurationError, NameInUse
 from skinware.memory.namespace import Namespace
+from skinware.native import give_arrays
 from skinware.realtime import NS_PER_S
 from skinware.status import Status
-from skinware.tactile.arrays import Bytes, Flags, Floats
-from skinware.tactile.baseline import SIGNED_TYPES, UNUSABLE
+from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats
+from skinware.tactile.baseline import SIGNED_TYPES
 from skinware.tactile.chain import Chain
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
 from skinware.tactile.motion import MotionWriter
 from skinware.tactile.neighbours import neighbours, posed
-from skinware.tactile.onsets import Onsets
 from skinware.tactile.regions import Regions
 from skinware.tactile.source_service import ServiceOptions, SourceWriter
+from skinware.tactile.stages import STRUCTS
 
 log: logging.Logger = logging.getLogger("skinware.calm")
 
 WriterT = TypeVar("WriterT", bound=SourceWriter)
+
+_find_loads = native.core().quick.skinware_chain_loads
+_find_loads.argtypes, _find_loads.restype = (ctypes.c_void_p,) * 2, None
 
 _HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
 
@@ -90,17 +96,43 @@ class DerivedService(ABC, Generic[WriterT]):
 
 
 class Loads:
-    """The loads of n taxels of a chain: values of one type, or lengths of vectors of three.
+    """The loads of n taxels of a chain: values of one type, or lengths of vectors of three; computed in C.
 
-    Contacts are those of the last type, ``type_name``.
+    Contacts are those of the last type, ``type_name``. All arrays are of the newest frame, and the next one overwrites
+    them.
+
+    Attributes:
+        load: (n,) float32, the loads.
+        touched: (n,) bool, which taxels are touched, of those with values of this frame.
+        more: onsets, clipped taxels, uncertainties (in the unit ``unit``; else None), and loads over noise.
     """
 
     def __init__(self, chain: Chain, names: tuple[str, ...]) -> None:
-        self.type_name, self.n_sensors = names[-1], chain.structure.n_sensors
-        self._stages = [chain.baseline_stages[name] for name in names]
-        self._indexes = [chain.structure.index(name) for name in names]
-        self._before = self._stages[-1].before
-        self._onsets = Onsets(len(self._before), self._before.resolution)
+        self.type_name = names[-1]
+        stages, n = [chain.baseline_stages[name] for name in names], len(chain.uid(names[0]))
+        before = stages[-1].before
+        axes, self._words = (STRUCTS["Axis"] * len(names))(), STRUCTS["Loads"]()
+        self._kept: list[Any] = [chain, axes]
+        for axis, name, stage in zip(axes, names, stages, strict=True):
+            shown = {
+                key: getattr(stage.shown, key) for key in ("baseline", "uncertainty", "noise", "touched", "usable")
+            }
+            given: Arrays = {"index": chain.structure.index(name), "given": stage.given}
+            self._kept.append(give_arrays(axis, n, {}, given | shown))
+        self._words.n, self._words.n_axes, self._words.axes = n, len(names), ctypes.addressof(axes)
+        self._words.resolution, self._words.maximum = before.resolution, before.type.maximum
+        arrays = give_arrays(self._words, n, {})
+        self.load: Floats = arrays["load"]
+        self.touched: Flags = arrays["touched"]
+        is_in_unit = chain.structure.type(self.type_name).unit == before.type.unit
+        self.more: More = {
+            "onset": arrays["onset"],
+            "clipped": arrays["clipped"],
+            "uncertainty": arrays["doubt"] if is_in_unit else None,
+            "sigmas": arrays["sigmas"],
+        }
+        self._kept.append(arrays)
+        self._at = chain.at, ctypes.addressof(self._words)
 
     @classmethod
     def of(cls, chain: Chain) -> Self | None:
@@ -111,43 +143,9 @@ class Loads:
         vectors = [names for names in chain.vectors if set(names) <= set(chain.baseline_stages)]
         return cls(chain, vectors[0]) if vectors else None
 
-    def usable(self, status: Bytes) -> Flags:
-        """Return (n,) bool, which taxels have values of this frame, of (n_sensors,) status."""
-        usable: Flags = np.logical_and.reduce([(status[index] & UNUSABLE) == 0 for index in self._indexes])
-        return usable
-
-    def values(self, values: Floats) -> Floats:
-        """Return (n,) loads of (n_sensors,) values."""
-        return _length([values[index] for index in self._indexes])
-
-    @property
-    def touched(self) -> Flags:
-        """(n,) bool, which taxels are touched in the newest frame."""
-        touched: Flags = np.logical_or.reduce([stage.touched for stage in self._stages])
-        return touched
-
-    def more(self, usable: Flags, unit: str) -> More:
-        """Return onsets, clipped taxels, (in the same unit) uncertainties and loads over noise, as far as known."""
-        calms = [(stage.given, stage.calm) for stage in self._stages if stage.calm is not None]
-        if not calms:
-            return {}
-        deviation = _length([given - calm.baseline for given, calm in calms])
-        doubt = _length([np.hypot(calm.noise, calm.uncertainty) for _, calm in calms]) / np.sqrt(np.float32(len(calms)))
-        known = np.logical_and.reduce([usable, *(calm.usable for _, calm in calms)])
-        clipped = np.logical_or.reduce([given >= self._before.type.maximum for given, _ in calms])
-        given, calm = calms[-1]  # of a vector, the axis along the normal: shear moves its length before it slips
-        return {
-            "onset": self._onsets.update(deviation, doubt, known),
-            "clipped": clipped,
-            "uncertainty": doubt if unit == self._before.type.unit else None,
-            "sigmas": (given - calm.baseline) / np.where(known & (calm.noise > 0), calm.noise, np.float32(np.nan)),
-        }
-
-
-def _length(axes: list[Floats]) -> Floats:
-    """Return (n,) lengths of vectors, by their axes (n,) each; one axis is its own length, with its sign."""
-    length: Floats = axes[0] if len(axes) == 1 else np.sqrt(sum(axis**2 for axis in axes))
-    return length
+    def find(self) -> None:
+        """Find the loads in what the chain made of the newest frame."""
+        _find_loads(*self._at)
 
 
 class CalmContacts(DerivedService[ContactsWriter]):
@@ -188,20 +186,14 @@ class CalmContacts(DerivedService[ContactsWriter]):
             more = {"driver": self._driver, "neighbours": beside, "rate_hz": rate_hz}
             self._open(ContactsWriter, structure, type_name, **more)
 
-    def publish(self, values: Floats, status: Bytes, acquired_ns: int) -> None:
-        """Find the contacts in the (n_sensors,) output of the chain, and publish them."""
+    def publish(self, acquired_ns: int) -> None:
+        """Find the contacts in the output of the chain, and publish them."""
         if self.writer is None or self._loads is None:
             return
-        usable, loads = self._loads.usable(status), self._loads.values(values)
-        more = self._loads.more(usable, self.writer.source.unit)
+        loads = self._loads
+        loads.find()
         with self._or_none():
-            self.newest = self.writer.publish(loads, self._loads.touched & usable, acquired_ns, **more), loads
-
-    def publish_none(self, time_ns: int) -> None:
-        """Publish that nothing is touched, as the driver is dead."""
-        if self._loads is not None:
-            n = self._loads.n_sensors
-            self.publish(np.zeros(n, np.float32), np.full(n, np.uint8(UNUSABLE)), time_ns)
+            self.newest = self.writer.publish(loads.load, loads.touched, acquired_ns, **loads.more), loads.load
 
     def close(self) -> None:
         super().close()

@@ -1,4 +1,4 @@
-"""Find touches within two frames, before a baseline has confirmed them, and turn contacts into events."""
+"""Turn contacts into events: some begin within two frames, before a baseline has confirmed them."""
 
 from __future__ import annotations
 
@@ -6,42 +6,13 @@ import enum
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from skinware.realtime import NS_PER_S
-from skinware.tactile.arrays import Flags, Floats
 
 if TYPE_CHECKING:
     from skinware.tactile.contacts import Contact, ContactSet
 
 
-_ABOVE_SIGMA = 5.0  # standard deviations of its noise by which a taxel must be above its baseline
-_ENOUGH, _FRAMES = 2, 3  # in how many of the last frames
 _GONE_S = 0.08  # seconds after which a contact that is missing has ended: longer than its identity is kept
-
-
-class Onsets:
-    """Finds which of n taxels have risen beyond their own noise in two of the last three frames.
-
-    Nothing is smoothed: a spike of one frame is none, and a touch is found in its second frame, at any rate.
-    ``resolution`` is the step of the values, in the unit of the noise; 0 if they have none.
-    """
-
-    def __init__(self, n: int, resolution: float = 0.0) -> None:
-        self._least = _ENOUGH * resolution
-        self._were: list[Flags] = [np.zeros(n, bool) for _ in range(_FRAMES - 1)]
-
-    def update(self, above: Floats, noise: Floats, usable: Flags) -> Flags:
-        """Return (n,) bool, which taxels are touched, as far as the newest frames say.
-
-        ``above`` is how far each value is above its baseline, not smoothed, and ``noise`` the standard deviation of
-        that, noise and baseline; NaN: not known, so that nothing is found. ``usable`` values are of this frame.
-        """
-        is_above = usable & (above > np.maximum(_ABOVE_SIGMA * noise, self._least))
-        count = np.sum([is_above, *self._were], axis=0, dtype=np.int8)
-        self._were = [*self._were[1:], is_above]
-        onset: Flags = is_above & (count >= _ENOUGH)
-        return onset
 
 
 class EventKind(enum.IntEnum):

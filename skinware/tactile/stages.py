@@ -6,17 +6,21 @@ The settings of a stage are also its entry in the file of a chain.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from skinware import native
 from skinware.errors import ConfigurationError
+from skinware.native import give_arrays, read_structs
 from skinware.realtime import NS_PER_S
 from skinware.sensor_types import SensorType
 from skinware.structure import Structure
@@ -27,9 +31,14 @@ NO_UNIT = "1"
 """Unit of values that are no quantity any more."""
 
 
-@dataclass(eq=False)
+STRUCTS = read_structs([Path(native.__file__).with_name("chain.h")])
+"""The structs of chain.h."""
+
+
 class Signal:
-    """One frame of n taxels on its way through stages, which change it in place.
+    """One frame of n taxels on its way through stages, which change its arrays in place.
+
+    ``index`` is (n,) where they stand in a snapshot.
 
     Attributes:
         time_ns: time of the frame.
@@ -37,27 +46,36 @@ class Signal:
         usable: (n,) bool, which values are of this frame.
         jumped: (n,) bool, where the hardware moved its own baseline just before it.
         forced: (n,) bool, where a stage moved a baseline by force.
-        bears: (n,) bool, where the vector of which a value is an axis bears a load; None: not known.
+        bears: (n,) bool, where the vector of which a value is an axis bears a load.
         unknown: (n,) bool, where a stage has no result yet; the value is 0.
         deviation: (n,) float32, how far a baseline found the values from it, touched or not; before that, the values.
+        at: address of its ``struct signal``, for C.
     """
 
-    time_ns: int
-    values: Floats
-    usable: Flags
-    jumped: Flags
-    forced: Flags
-    unknown: Flags
-    deviation: Floats
-    bears: Flags | None = None
+    def __init__(self, index: npt.ArrayLike) -> None:
+        words, given = STRUCTS["Signal"](), np.array(index, np.int64)
+        words.n = len(given)
+        self.time_ns = 0
+        self._kept = words, give_arrays(words, len(given), {}, {"index": given})
+        arrays = self._kept[1]
+        self.values: Floats = arrays["values"]
+        self.deviation: Floats = arrays["deviation"]
+        self.usable: Flags = arrays["usable"]
+        self.jumped: Flags = arrays["jumped"]
+        self.forced: Flags = arrays["forced"]
+        self.unknown: Flags = arrays["unknown"]
+        self.bears: Flags = arrays["bears"]
+        self.at: int = ctypes.addressof(words)
 
     @classmethod
     def of(cls, time_ns: int, values: npt.ArrayLike, usable: npt.ArrayLike | None = None) -> Self:
         """Make a signal of (n,) values; default of ``usable``: all finite ones."""
         taken = np.array(values, np.float32)
-        known = np.isfinite(taken) if usable is None else np.isfinite(taken) & usable
-        none = np.zeros(len(taken), bool)
-        return cls(time_ns, taken, known, none, none.copy(), none.copy(), taken)
+        signal = cls(np.arange(len(taken)))
+        signal.time_ns = time_ns
+        signal.values[:], signal.deviation[:] = taken, taken
+        signal.usable[:] = np.isfinite(taken) if usable is None else np.isfinite(taken) & usable
+        return signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +201,7 @@ class Lowpass(Stage):
         share = np.float32(-math.expm1(-self._passed_s(signal) / self._tau_s))
         np.copyto(self._smooth, signal.values, where=signal.usable & np.isnan(self._smooth))
         self._smooth += np.where(signal.usable, signal.values - self._smooth, np.float32(0)) * share
-        signal.values = np.where(np.isnan(self._smooth), signal.values, self._smooth)
+        signal.values[:] = np.where(np.isnan(self._smooth), signal.values, self._smooth)
 
 
 class LastFrames(Stage):
@@ -207,7 +225,7 @@ class LastFrames(Stage):
             found = ordered[middle] if len(ordered) % 2 else (ordered[middle - 1] + ordered[middle]) / 2
         else:
             found = ordered.mean(axis=0)
-        signal.values = np.where(np.isnan(found), signal.values, found)
+        signal.values[:] = np.where(np.isnan(found), signal.values, found)
 
 
 class ScalerSettings(StageSettings, frozen=True, kw_only=True, tag="scaler"):
@@ -263,7 +281,7 @@ class Scaler(Stage):
             self._least, self._most = np.fmin(self._least, seen), np.fmax(self._most, seen)
         span = self._most - self._least
         share = np.divide(signal.values - self._least, span, out=np.zeros_like(span), where=span > 0)
-        signal.values = (settings.low + (settings.high - settings.low) * np.clip(share, 0, 1)).astype(np.float32)
+        signal.values[:] = settings.low + (settings.high - settings.low) * np.clip(share, 0, 1)
 
 
 class AmplifierSettings(StageSettings, frozen=True, kw_only=True, tag="amplifier"):
@@ -304,7 +322,7 @@ class Amplifier(Stage):
         super().__init__(replace(taxels, type=amplified, resolution=step))
 
     def step(self, signal: Signal) -> None:
-        signal.values = self._of(signal.values).astype(np.float32)
+        signal.values[:] = self._of(signal.values)
 
     def _of(self, values: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
         settings = self._settings

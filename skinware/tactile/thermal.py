@@ -125,7 +125,7 @@ class ThermalStage(Stage):
         limits = self.taxels.type
         is_inside = (signal.values > limits.minimum) & (signal.values < limits.maximum)
         corrected = (signal.values - self._drift).astype(np.float32)
-        signal.values = np.where(is_inside, corrected, signal.values)
+        np.copyto(signal.values, corrected, where=is_inside)
 
     def _follow(self, pads: Signal, share: float) -> None:
         usable = pads.usable.astype(np.float64)

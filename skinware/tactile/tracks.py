@@ -61,7 +61,7 @@ class TouchedBlobs:
         frame: (m,) int64, number of its coordinate frame, -1 for none.
         cop_m: (m, 3) m, its centre; NaN if it is not known.
         is_sure: (m,) bool, whether any of its taxels is touched for sure.
-        frames: (m,) int64, how many frames speak for it: 2 where :class:`.Onsets` found a taxel.
+        frames: (m,) int64, how many frames speak for it: 2 where a taxel has an onset.
     """
 
     taxels: Whole

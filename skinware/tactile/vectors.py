@@ -131,7 +131,7 @@ class FieldStage(Stage):
         usable = np.logical_and.reduce([one.usable for one in signals])
         rest, sure = self.field.update(np.array([one.values for one in signals]), usable, self._passed_s(signal))
         for one, values in zip(signals, rest, strict=True):
-            one.values, one.usable, one.bears = values, sure, self.field.bears
+            one.values[:], one.usable[:], one.bears[:] = values, sure, self.field.bears
 
 
 class VectorSettings(StageSettings, frozen=True, kw_only=True, tag="vector"):
@@ -150,4 +150,4 @@ class VectorStage(Stage):
         signals = (signal, *others)
         touched = np.logical_or.reduce([one.values != 0 for one in signals])
         for one in signals:
-            one.values = np.where(touched & np.isfinite(one.deviation), one.deviation, np.float32(0))
+            one.values[:] = np.where(touched & np.isfinite(one.deviation), one.deviation, np.float32(0))

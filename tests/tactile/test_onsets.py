@@ -14,7 +14,8 @@ from skinware.tactile.baseline import Baseline
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.contacts_service import ContactsReader, ContactsWriter
 from skinware.tactile.neighbours import neighbours
-from skinware.tactile.onsets import ContactEvent, EventKind, Events, Onsets
+from skinware.tactile.onsets import ContactEvent, EventKind, Events
+from tests.specification.chain import Onsets
 from tests.tactile.skins import placed, triangles
 from tests.tactile.test_contacts_service import structure
 

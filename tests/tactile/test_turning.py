@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from skinware import DriverSnapshot, Status, Structure
@@ -17,7 +16,7 @@ from skinware.tactile.derived_services import Loads
 from skinware.tactile.stages import Taxels
 from skinware.tactile.vectors import ArrayField, FieldSettings, vectors_of
 from tests.cli.fake_skin import fake_structure
-from tests.tactile.turning import Turning, judge
+from tests.tactile.turning import Frame, Turning, judge
 
 CHAIN = 'format = "skinware-chain"\nversion = 1\n' + "".join(
     f'[[stage]]\nstage = "{stage}"\n' for stage in ("field", "baseline", "vector")
@@ -61,21 +60,6 @@ def test_twenty_fingers_turn(kind: str, how: dict[str, Any]) -> None:
     assert found.left.mean() <= 0.01
 
 
-class Frame(NamedTuple):
-    """As much of a snapshot as a chain reads."""
-
-    structure: Structure
-    acquired_ns: int
-    values: npt.NDArray[np.float64]
-
-    @property
-    def status(self) -> npt.NDArray[np.uint8]:
-        return np.zeros(self.structure.n_sensors, np.uint8)
-
-    def physical_values(self) -> npt.NDArray[np.float32]:
-        return self.values.astype(np.float32)
-
-
 def magnetometers(n: int = 8) -> Structure:
     return Structure(
         types=[one.measured(unit="uT") for one in MAGNETIC_FIELD],
@@ -102,20 +86,23 @@ def test_a_chain_takes_the_axes_of_a_driver_together(tmp_path: Path) -> None:
         turned = 20 * np.sin(number / 40 + np.arange(3))
         given = 100 + np.tile(turned, 8) + 0.3 * random.standard_normal(24)
         given[:3] += [3 * (number > 380), 0, 40 * (number > 380)]
-        chain.step(cast(DriverSnapshot, Frame(structure, number * 20_000_000, given)), values, status)
+        chain.step(
+            cast(DriverSnapshot, Frame(structure, number * 20_000_000, given, np.zeros(24, np.uint8))), values, status
+        )
     assert values.reshape(8, 3)[0] == pytest.approx([3, 0, 40], abs=2)
     assert not values[3:].any()
     assert not (status & Status.NEVER_SEEN).any()
     loads = Loads.of(chain)
     assert loads is not None
     assert loads.type_name == "magnetic_field_z"
-    assert loads.values(values)[0] == pytest.approx(40.1, abs=2)
+    loads.find()
+    assert loads.load[0] == pytest.approx(40.1, abs=2)
     assert np.flatnonzero(loads.touched).tolist() == [0]
-    status[1] = Status.STALE
-    assert np.flatnonzero(~loads.usable(status)).tolist() == [0]
-    more = loads.more(loads.usable(status), "uT")
-    assert more["uncertainty"] is not None
-    assert not np.any(more["clipped"])
+    assert loads.more["uncertainty"] is not None
+    assert not np.any(loads.more["clipped"])
+    chain.status[1] = Status.STALE
+    loads.find()
+    assert not loads.touched.any()
 
 
 def test_a_driver_without_vectors_or_with_few_is_refused(tmp_path: Path) -> None:

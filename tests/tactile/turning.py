@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware import Structure
 from skinware.sensor_types import MAGNETIC_FIELD, PRESSURE, SHEAR_X, SHEAR_Y
 from skinware.tactile.chain import BaselineStageSettings
 from skinware.tactile.stages import Signal, Stage, Taxels
@@ -23,6 +25,18 @@ PLACES = {
 EVERY_S, FIRST_S = 8.0, 16.0
 IDLE_UT = 0.3
 """A smaller load is none."""
+
+
+class Frame(NamedTuple):
+    """As much of a snapshot as a chain reads."""
+
+    structure: Structure
+    acquired_ns: int
+    values: npt.NDArray[Any]
+    status: npt.NDArray[np.uint8]
+
+    def physical_values(self) -> npt.NDArray[np.float32]:
+        return self.values.astype(np.float32)
 
 
 @dataclass

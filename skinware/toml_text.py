@@ -11,6 +11,7 @@ from types import GenericAlias
 from typing import Any, TypeVar
 
 import msgspec
+import msgspec.inspect
 
 from skinware.errors import ConfigurationError
 
@@ -66,7 +67,7 @@ class TomlText:
         try:
             return msgspec.convert(self.data, struct)
         except msgspec.ValidationError as error:
-            text, keys = wrong_value(error)
+            text, keys = wrong_value(error, struct)
             raise ConfigurationError(f"{self.place(keys)}: {text}") from None
 
     def entries(self, what: str, format_name: str, version: int, key: str, kind: Any) -> tuple[Any, ...]:
@@ -79,10 +80,36 @@ class TomlText:
         return found
 
 
-def wrong_value(error: msgspec.ValidationError) -> tuple[str, Keys]:
+def wrong_value(error: msgspec.ValidationError, struct: type[msgspec.Struct]) -> tuple[str, Keys]:
+    """Return what is wrong in data for a struct, with the choices where there are some, and the place of the value."""
     text = str(error).replace("`", "")
-    keys = _KEYS_IN_ERROR.findall(text.rpartition("$")[2])
-    return text, tuple(int(number) if number else key for key, number in keys)
+    found = _KEYS_IN_ERROR.findall(text.rpartition("$")[2])
+    keys = tuple(int(number) if number else key for key, number in found)
+    choices = _choices(msgspec.inspect.type_info(struct), keys) if text.startswith("Invalid enum value") else []
+    return (f"{text}; there are {', '.join(choices)}" if choices else text), keys
+
+
+def _choices(kind: msgspec.inspect.Type, keys: Keys) -> list[str]:
+    """Return the texts that may stand at a place in a value of such a type."""
+    match kind:
+        case msgspec.inspect.Metadata():
+            return _choices(kind.type, keys)
+        case msgspec.inspect.UnionType():
+            return [choice for one in kind.types for choice in _choices(one, keys)]
+        case msgspec.inspect.LiteralType() if not keys:
+            return [repr(value) for value in kind.values if value]
+        case msgspec.inspect.StructType() if keys:
+            return [
+                found
+                for field in kind.fields
+                if field.encode_name == keys[0]
+                for found in _choices(field.type, keys[1:])
+            ]
+        case msgspec.inspect.VarTupleType() | msgspec.inspect.ListType() if keys:
+            return _choices(kind.item_type, keys[1:])
+        case msgspec.inspect.DictType() if keys:
+            return _choices(kind.value_type, keys[1:])
+    return []
 
 
 def line_of(text: str, keys: Sequence[str | int]) -> int:

@@ -6,6 +6,7 @@ A command is a module with a click command and ``main = partial(cli.run, command
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import logging
 import math
@@ -289,7 +290,8 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
         echo(f"{name}: {error}", err=True)
         return EXIT_USAGE if isinstance(error, ConfigurationError | BadRecording) else EXIT_FAILED
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        where = f"{error.filename}: " if error.filename else "its output cannot be written: " if is_full else ""
         echo(f"{name}: {where}{error.strerror or error}", err=True)
         _discard_output()
         return EXIT_USAGE if isinstance(error, FileNotFoundError | FileExistsError) else EXIT_FAILED

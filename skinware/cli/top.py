@@ -69,6 +69,8 @@ def command(
     """
     from skinware.memory.namespace import Namespace
 
+    if plain or as_json:
+        cli.refuse_others("--plain" if plain else "--json", {"plain", "as_json", "duration_s", "namespace"})
     place = Namespace(namespace)
     names = () if region is None else (region,)
     regions = cli.regions_of(region_files, names) if names or region_files else None

@@ -156,7 +156,7 @@ def _convert(struct: type[T], data: Mapping[str, Any]) -> T:
     except ConfigurationError as error:
         raise _Wrong(str(error), ()) from None
     except msgspec.ValidationError as error:
-        text, keys = wrong_value(error)
+        text, keys = wrong_value(error, struct)
         raise _Wrong(str(error.__cause__) if isinstance(error.__cause__, ConfigurationError) else text, keys) from None
 
 

@@ -278,4 +278,7 @@ def test_a_reader_of_our_output_may_go_away(form: str) -> None:
 def test_a_full_disk_is_said_in_one_line() -> None:
     with publishing(FakeSkin("a", fake_structure(1, 1))), open("/dev/full", "w", encoding="ascii") as full:
         result = subprocess.run([BIN / "skin-dump"], stdout=full, stderr=subprocess.PIPE, timeout=PATIENCE_S)
-    assert (result.returncode, result.stderr) == (1, b"skin-dump: No space left on device\n")
+    assert (result.returncode, result.stderr) == (
+        1,
+        b"skin-dump: its output cannot be written: No space left on device\n",
+    )

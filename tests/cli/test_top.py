@@ -116,11 +116,13 @@ def test_the_live_view_is_loaded_only_when_it_is_needed() -> None:
 def test_a_region_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "regions.toml"
     put_region(file, Region("palm", uid=(1,)))
-    assert exit_status(command, ["--plain", "-T", "0", "--region", "palm", "--regions", str(file)]) == 0
+    assert exit_status(command, ["-T", "0", "--region", "palm", "--regions", str(file)]) == 0
     capsys.readouterr()
     for arguments, why in (
         (["--region", "plam", "--regions", str(file)], "no region 'plam'; there are: palm"),
         (["--regions", str(tmp_path / "none.toml")], "none.toml: No such file"),
+        (["--plain", "--region", "palm"], "--plain goes without --region"),
+        (["--json", "--type", "pressure"], "--json goes without --type"),
     ):
-        assert exit_status(command, ["--plain", *arguments]) == 2
+        assert exit_status(command, arguments) == 2
         assert why in capsys.readouterr().err

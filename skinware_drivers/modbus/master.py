@@ -14,6 +14,7 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.fields import Reply
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Guests
+from skinware_drivers.modbus.overdue import Overdue
 from skinware_drivers.modbus.registers import Image, Read, Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.running.guard import Backoff, pauses_of_device
@@ -104,9 +105,10 @@ class Schedule:
 class Master:
     """Ask for the registers of a schedule, and in between for what the driver and other programs ask.
 
-    After a timeout, nothing is asked until the late reply has come or as much time again has passed. On a serial line,
-    a reply does not say which question it answers. Over TCP it has the number of its question, but some servers, when
-    two questions are open, answer the first with the number of the second (pymodbus 3.16).
+    After a timeout, nothing is asked until the late reply has come or as much time again has passed; more if nothing
+    answers at all, as behind a slow link. On a serial line, a reply does not say which question it answers. Over TCP it
+    has the number of its question, but some servers, when two questions are open, answer the first with the number of
+    the second (pymodbus 3.16). So a reply that may answer an earlier question is dropped, with those that follow it.
 
     Between two reads that are due, one question of other programs is asked. Those are never repeated.
 
@@ -139,6 +141,7 @@ class Master:
         self._was_guest = False
         self._open: Open | None = None
         self._late: Open | None = None
+        self._overdue = Overdue(timing.timeout_ns)
         self._again: Open | None = None
         self._free_ns = begun_ns
 
@@ -168,9 +171,12 @@ class Master:
             self._give_up(self._open, time_ns)
         if self._open is not None or time_ns < self._free_ns:
             return b""
-        if self._late is not None:  # a reply that comes even later is noise, or answers the same question again
+        if self._late is not None:
+            self._overdue.lose(self._late.message, self._asked_ns(self._late))
             self._late = None
             self._drop_from_line()
+        if self._overdue.drains:
+            self._overdue.end()
         if self._again is not None:
             again, self._again = self._again, None
             return self._ask(again.message, again.read, time_ns, again.tries)
@@ -195,9 +201,9 @@ class Master:
             for message in self._line.feed(chunk):
                 asked, late = self._open, self._late
                 if asked is not None and (message.number, message.unit) == (asked.message.number, asked.message.unit):
-                    self._take(asked, message, time_ns)
+                    self._take_if_sure(asked, message, time_ns)
                 elif late is not None and message.number == late.message.number:
-                    self._take_late(late, message, time_ns)
+                    self._take_if_sure(late, message, time_ns)
                 else:
                     self._counters.refused += 1
             return
@@ -208,19 +214,35 @@ class Master:
             return
         damaged = self._counters.framing.checksum_errors
         found = self._line.reply_to(asked.message.unit, asked.message.data)
-        if asked is self._late:
-            if found is not None:
-                self._take_late(asked, found, time_ns)
-        elif found is not None:
-            self._take(asked, found, time_ns)
-            self._line.drop()  # no unit may speak unasked
-        elif self._counters.framing.checksum_errors > damaged:
+        if found is not None:
+            was_late = asked is self._late
+            self._take_if_sure(asked, found, time_ns)
+            if not was_late:
+                self._line.drop()  # no unit may speak unasked
+        elif asked is not self._late and self._counters.framing.checksum_errors > damaged:
             # bytes as long as the reply, which are none: ask again, once the line is silent
             self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
             if asked.read == _GUEST:
                 self._guests.answer(None, time_ns)
             elif asked.tries < _MOST_TRIES:
                 self._again = asked
+
+    def _take_if_sure(self, asked: Open, message: Message, time_ns: int) -> None:
+        if self._overdue.confuses(asked.message):
+            self._open = self._late = None
+            self._free_ns = self._overdue.drain(asked.message, self._asked_ns(asked), time_ns)
+            self._counters.refused += 1
+            self._schedule.retries.pop(("unit", message.unit), None)
+            if asked.read == _GUEST:
+                self._guests.answer(None, time_ns)
+        elif asked is self._late:
+            self._take_late(asked, message, time_ns)
+        else:
+            self._overdue.take()
+            self._take(asked, message, time_ns)
+
+    def _asked_ns(self, asked: Open) -> int:
+        return asked.until_ns - self._timing.timeout_ns
 
     def _take(self, asked: Open, message: Message, time_ns: int) -> None:
         self._open = None
@@ -247,15 +269,18 @@ class Master:
     def _take_late(self, asked: Open, message: Message, time_ns: int) -> None:
         """Use a reply that came after its timeout: the device lives."""
         self._late, self._free_ns = None, time_ns + self._timing.turnaround_ns
+        self._overdue.take_late(time_ns - asked.until_ns)
         self._counters.polls_late += 1
         self._schedule.retries.pop(("unit", message.unit), None)
         if self._counters.polls_late == 1:
             log.warning(
-                "%s: unit %d answers %.3g ms after timeout_s = %.3g ms: make timeout_s longer; logged once",
+                "%s: unit %d answers %.3g ms after timeout_s = %.3g ms, and others wait for it: make it longer, such as"
+                " ?timeout_ms=%.0f; logged once",
                 self._name,
                 message.unit,
                 (time_ns - asked.until_ns) / 1e6,
                 self._timing.timeout_ns / 1e6,
+                2 * (time_ns - self._asked_ns(asked)) / 1e6,
             )
         is_good = wire.is_reply(asked.message.data, message.data) and not wire.exception_of(message.data)
         if asked.read >= 0 and is_good:
@@ -286,7 +311,7 @@ class Master:
             self._schedule.retries["unit", asked.message.unit].begin(time_ns)
         if asked.read == _GUEST:
             self._guests.answer(None, time_ns)
-        self._late, self._free_ns = asked, time_ns + self._timing.timeout_ns
+        self._late, self._free_ns = asked, time_ns + self._overdue.wait_ns
         self._drop_from_line()
 
     def _drop_from_line(self) -> None:

@@ -61,7 +61,8 @@ class NativeMaster(Master):
             The address of C's state; None: only Python can do what comes next.
         """
         schedule = self._schedule
-        asks_otherwise = self._commands or self._again or self._late or schedule.retries or self._guests.are_waiting
+        is_late = self._late or not self._overdue.is_none
+        asks_otherwise = self._commands or self._again or is_late or schedule.retries or self._guests.are_waiting
         is_unusual = self._open is not None and (self._open.read < 0 or self._open.tries > 1)
         if not self._can or self._is_stuck or asks_otherwise or is_unusual or self.rows or self.pending:
             return None

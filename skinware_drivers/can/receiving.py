@@ -20,7 +20,7 @@ import numpy.typing as npt
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.device_time import DeviceClock, Times
+from skinware_drivers.native.device_time import DeviceClock, Times
 
 NO_CAN = "this kernel has no CAN: load it (sudo modprobe can-raw), or use a bus that needs none (--bus virtual)"
 

@@ -12,14 +12,12 @@ import numpy.typing as npt
 
 from skinware.samples import Unused
 from skinware.status import Status
-from skinware.structure import Structure
 from skinware_drivers.counters import Samples
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS
 from skinware_drivers.decoding.compiled import CompiledLayouts
 from skinware_drivers.description import SkinTables
-from skinware_drivers.device_time import DeviceClock
-from skinware_drivers.fields import DeviceTime, SequenceNumber
-from skinware_drivers.layout import Frame, Layout
+from skinware_drivers.fields import SequenceNumber
+from skinware_drivers.layout import Layout
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -144,69 +142,17 @@ class SkinState:
 
 NONE_YET = -1
 _MUCH_HASTE, _NEVER_AGAIN = 200, -(1 << 62)
-"""Frames that come too soon, with no whole cycle between, before a warning is logged; and their number afterwards."""
+"""Frames that come too soon, with no whole cycle between, before a warning is logged; and their number, and that
+of a clock's stops, afterwards."""
 
 
 def read_numbers(payload: Bytes, sequence: SequenceNumber) -> Indices:
     """Return (n,) the sequence number in each of n payloads; ``payload``: (n, size) uint8."""
-    word = _words(payload, sequence)
+    word = np.ascontiguousarray(payload[:, sequence.offset : sequence.end]).view(sequence.dtype)[:, 0]
     if sequence.mask is not None:
         word = (word & word.dtype.type(sequence.mask)) >> word.dtype.type(sequence.shift)
     plain: Indices = word.astype(np.int64)
     return plain
-
-
-def _words(payload: Bytes, where: SequenceNumber | DeviceTime) -> npt.NDArray[Any]:
-    return np.ascontiguousarray(payload[:, where.offset : where.end]).view(where.dtype)[:, 0]
-
-
-class DeviceStamps:
-    """The clocks of all patches; a patch is one device.
-
-    Attributes:
-        times: kinds of frame with a stamp, and the place of the stamp.
-        clocks: by patch, of those that have sent a stamp.
-    """
-
-    def __init__(self, frames: Sequence[Frame], structure: Structure) -> None:
-        self.times = [(number, frame.time) for number, frame in enumerate(frames) if frame.time is not None]
-        self._structure = structure
-        self._module_patch = structure.module_patch.astype(np.intp)
-        self._warned: set[int] = set()
-        self.clocks: dict[int, DeviceClock] = {}
-
-    def apply(self, kind: Bytes, module: Indices, payload: Bytes, time_ns: Indices) -> None:
-        """Replace the times (CLOCK_MONOTONIC ns) at which n frames were received by those at which they were stamped.
-
-        Modules from ``n_modules`` on are none.
-        """
-        if not self.times:
-            return
-        stamp = np.full(len(kind), -1, np.int64)
-        sent: dict[int, DeviceTime] = {}
-        for number, time in self.times:
-            rows = np.flatnonzero((kind == number) & (module < len(self._module_patch)))
-            if len(rows):
-                stamp[rows] = _words(payload[rows], time).astype(np.int64) % time.turn
-                sent.update(dict.fromkeys(np.unique(self._module_patch[module[rows]]).tolist(), time))
-        rows = np.flatnonzero(stamp >= 0)
-        patch = self._module_patch[module[rows]]
-        for number, time in sent.items():
-            own = rows[patch == number]
-            if number not in self.clocks:
-                self.clocks[number] = DeviceClock(time.unit_s, time.turn)
-            time_ns[own] = self.clocks[number].convert(stamp[own], time_ns[own])
-            if self.clocks[number].stops and number not in self._warned:
-                self._warned.add(number)
-                log.warning(
-                    "%s: the clock of %s stands still, or is far too slow: its samples have the times of their"
-                    " receipt; logged once",
-                    self._structure.buses[self._structure.patch_bus[number]],
-                    self._structure.patch_name[number].decode(),
-                )
-
-    def forget(self, patch: int) -> None:
-        self.clocks.pop(patch, None)
 
 
 class Decoder:
@@ -219,6 +165,8 @@ class Decoder:
         last_sequence: (n_modules,) int64, the last sequence number of each; -1: none yet.
         module_flags: (n_modules,) uint8, status bits that status frames set for other modules.
         haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
+        knows_clock: (n_patches,) bool, something is known of the device's own clock.
+        clock_stops: (n_patches,) int64, how often that clock was found to stand still.
         unknown_identifiers: (n_buses, 2048) int64, frames of each identifier of 11 bits that are of no module.
     """
 
@@ -234,13 +182,14 @@ class Decoder:
         self.last_sequence = np.full(structure.n_modules, NONE_YET, np.int64)
         self.module_flags = np.zeros(structure.n_modules, np.uint8)
         self.haste = np.zeros(structure.n_patches, np.int64)
-        self.device_stamps: DeviceStamps = DeviceStamps(self.compiled.frames, structure)
+        self.knows_clock = np.zeros(structure.n_patches, bool)
+        self.clock_stops = np.zeros(structure.n_patches, np.int64)
         shape = len(structure.buses), STANDARD_IDENTIFIERS
         self.unknown_identifiers: npt.NDArray[np.int64] = np.zeros(shape, np.int64)
 
     def forget(self, patch: int) -> None:
         """Forget the sequence numbers, the flags, the rhythm and the clock of a patch that has restarted."""
-        self.device_stamps.forget(patch)
+        self.knows_clock[patch] = False
         modules = np.flatnonzero(self._module_patch == patch)
         self.last_sequence[modules] = NONE_YET
         self.module_flags[modules] = 0
@@ -254,11 +203,21 @@ class Decoder:
                 if samples.wants(why):
                     samples.take(why, wire[rows[bus[rows] == ordinal]])
 
-    def warn_of_haste(self) -> None:
+    def warn(self) -> None:
+        """Log once that a patch sends too fast, or that its clock stands still."""
+        structure = self.tables.structure
+        for patch in np.flatnonzero(self.clock_stops > 0).tolist():
+            self.clock_stops[patch] = _NEVER_AGAIN
+            log.warning(
+                "%s: the clock of %s stands still, or is far too slow: its samples have the times of their"
+                " receipt; logged once",
+                structure.buses[structure.patch_bus[patch]],
+                structure.patch_name[patch].decode(),
+            )
         for patch in np.flatnonzero(self.haste > _MUCH_HASTE).tolist():
             self.haste[patch] = _NEVER_AGAIN
             log.warning(
                 "%s sends its cycles so fast that several fit into the layout's maximum_age_s: they cannot be"
                 " distinguished and are not shown; give the driver the right period (period_ms, period_s); logged once",
-                self.tables.structure.patch_name[patch].decode(),
+                structure.patch_name[patch].decode(),
             )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.compiled import CompiledCycle, FrameKind
@@ -98,6 +99,7 @@ def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays
     plan.first_group = arrays.of(np.searchsorted(structure.group_patch, np.arange(structure.n_patches)), np.int64)
     plan.patch_bus = arrays.of(structure.patch_bus, np.int64)
     plan.last_sequence, plan.haste = arrays.at(decoder.last_sequence), arrays.at(decoder.haste)
+    plan.knows_clock, plan.clock_stops = arrays.at(decoder.knows_clock), arrays.at(decoder.clock_stops)
     if any(frame.module_flags for frame in compiled.frames):
         plan.module_flags = arrays.at(decoder.module_flags)
     plan.unknown_identifiers = arrays.at(decoder.unknown_identifiers)
@@ -182,6 +184,9 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
         kind.names_module, kind.key_byte, kind.key_shift = True, bits.byte, bits.shift
         kind.key_mask, kind.n_keys, kind.module_by_key = (1 << bits.width) - 1, table.shape[1], arrays.at(table)
     kind.sequence = _number(frame.sequence)
+    if frame.time is not None:
+        kind.stamp = structs.Number(1, frame.time.offset, *_type(frame.time.dtype), -1, 0, frame.time.turn)
+        kind.stamp_unit_ns = frame.time.unit_s * NS_PER_S
     return kind
 
 

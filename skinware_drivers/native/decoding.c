@@ -158,8 +158,7 @@ void decode_batch(struct path *path)
     if (path->words->expects_data)
         plan->hooks.hear();
     name_rows(path, time_ns);
-    if (plan->hooks.tell_times)
-        plan->hooks.tell_times();
+    tell_times(path);
     keep_after_boot(path);
     path->n_carried = 0;
     read_alone(path);

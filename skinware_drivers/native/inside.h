@@ -12,7 +12,7 @@ struct words { /* what Python sees and sets between calls */
     int64_t n_held;   /* updates that are held back from one take to the next */
     int64_t newest_ns, due_ns, not_before_ns, last_published_ns;
     int64_t on_request, wanted_ns; /* publish only what is asked for; the oldest data that somebody waits for */
-    int64_t hastened;              /* frames came too soon: plan.haste has more */
+    int64_t warns;                 /* frames came too soon, or a clock stands still: plan.haste, plan.clock_stops */
     int64_t store;                 /* address of the updates */
     int64_t sequence;              /* of the newest frame */
     int64_t must_leave;            /* the event loop has something to do */
@@ -27,6 +27,18 @@ struct update { /* followed by int32_t sensors[width], values[width], uint8_t st
     int64_t module, row, whole, is_flagged, oldest_ns, newest_ns;
     int64_t group;  /* the first of its update groups stands for it */
     int64_t groups; /* address of all of them, plan.most_groups */
+};
+
+struct clock_point { /* a frame: the number of its part of time, and since the clock's origin, its stamp and delay */
+    int64_t part;
+    double device_ns, delay_ns;
+};
+
+struct device_clock { /* stamp: the last one, -1: the next one begins; drift, offset_ns: of the line of delays */
+    double unit_ns, drift, offset_ns;
+    int64_t modulo, part_ns, jump_ns; /* a part has one point; a stamp so far in the future: the clock was set */
+    struct clock_point *points;       /* (CLOCK_PARTS,) the frame of least delay of each part, oldest first */
+    int64_t n_points, origin_ns, ticks, stamp, received_ns, last_ns, restarts, stops;
 };
 
 struct chain { /* the last element of every key so far, forgotten all at once */
@@ -64,6 +76,8 @@ struct path {
     uint8_t *has_failed;
     int64_t *of_group, *of_patch_ns; /* (n_groups,), (n_patches,) */
     struct chain updated_groups, patches;
+    struct device_clock *clocks; /* (n_patches,) */
+    struct clock_point *clock_points;
     uint8_t *is_open, *was_open, *has_begun; /* (n_patches,) */
     int64_t n_split;              /* frames in turn that held a long pause */
     uint8_t *is_early;            /* (n_groups,) what came before it */
@@ -142,6 +156,7 @@ uint64_t read_word(const uint8_t *at, int64_t type, int64_t is_swapped);
 int64_t read_number(const uint8_t *payload, const struct number *number);
 
 void name_rows(struct path *path, int64_t time_ns);
+void tell_times(struct path *path);
 void count_strangers(struct path *path, const int64_t *rows, int64_t n, int64_t time_ns);
 void find_cycles(struct path *path, const struct cycle *cycle, int64_t number);
 int64_t new_update(struct path *path);

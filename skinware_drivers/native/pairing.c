@@ -217,7 +217,7 @@ void find_cycles(struct path *path, const struct cycle *cycle, int64_t number)
         }
         if (path->is_orphan[i]) {
             path->next[row] = m + i;
-            path->words->hastened |= path->is_soon[i];
+            path->words->warns |= path->is_soon[i];
             plan->haste[plan->module_patch[path->entry[row]]] += path->is_soon[i];
         } else if (path->is_waiting[i])
             path->next[row] = 2 * m + i;

@@ -54,6 +54,7 @@ SKINWARE_EXPORT void skinware_path_free(struct path *path)
                    path->carried_wire,    path->carried_time_ns, path->carried_bus, path->store,        path->spare,
                    path->list,            path->other,         path->before,        path->of_patch,     path->of_group,
                    path->of_patch_ns,     path->is_open,       path->was_open,      path->has_begun,
+                   path->clocks,          path->clock_points,
                    path->is_early};
     for (size_t i = 0; i < sizeof all / sizeof *all; i++)
         free(all[i]);
@@ -98,6 +99,8 @@ SKINWARE_EXPORT struct path *skinware_path_new(const struct plan *plan, struct b
     path->was_open = room(path, plan->n_patches, 1);
     path->has_begun = room(path, plan->n_patches, 1);
     path->is_early = room(path, plan->n_groups, 1);
+    path->clocks = room(path, plan->n_patches, sizeof *path->clocks);
+    path->clock_points = room(path, CLOCK_PARTS * plan->n_patches, sizeof *path->clock_points);
     lay_out_updates(path);
     words->entry = (int64_t)(intptr_t)path->entry;
     words->kind = (int64_t)(intptr_t)path->kind;

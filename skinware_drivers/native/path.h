@@ -15,7 +15,7 @@
 #include <stdint.h>
 #include <string.h>
 
-enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, MOST_MEMBERS = 128 };
+enum { NO_KIND = 255, STANDARD_IDENTIFIERS = 1 << 11, MOST_MEMBERS = 128, CLOCK_PARTS = 60 };
 #define NEVER_NS (-(INT64_C(1) << 62)) /* punctuality: none came yet */
 
 /* -- what a layout compiles to ------------------------------------------------------------------------------------- */
@@ -79,7 +79,8 @@ struct kind { /* a kind of frame */
     const struct flag *flags;
     int64_t names_module, key_byte, key_shift, key_mask, n_keys;
     const int64_t *module_by_key; /* (patches, n_keys) */
-    struct number sequence;
+    struct number sequence, stamp; /* stamp: of the device's clock */
+    double stamp_unit_ns;
 };
 
 struct assembly { /* what makes one update of a module */
@@ -115,7 +116,6 @@ struct batch {
 
 struct hooks {             /* NULL: there is nothing to do */
     void (*hear)(void);       /* frames of the batch have come, and somebody may wait for one that is data */
-    void (*tell_times)(void); /* rows have kinds and modules, some of these tell a time of their own */
     void (*offer)(const int64_t *rows, int64_t n); /* rows that are of no module of ours */
     void (*keep)(int64_t why, const int64_t *rows, int64_t n); /* rows that cannot be used, for the samples */
     void (*expand)(int64_t kind, const int64_t *updates, const int64_t *rows, uint8_t *has_failed, int64_t n);
@@ -166,6 +166,8 @@ struct plan {
     int64_t *last_sequence;       /* (n_modules,) */
     uint8_t *module_flags;        /* (n_modules,) status that frames of others set; NULL: no frame does */
     int64_t *haste;               /* (n_patches,) */
+    uint8_t *knows_clock;         /* (n_patches,) bool: something is known of the device's clock */
+    int64_t *clock_stops;         /* (n_patches,) how often it was found to stand still */
     int64_t *unknown_identifiers; /* (n_buses, 2048) */
     int64_t *sample_next_ns;      /* (n_buses, N_SAMPLE_KINDS): when a sample is wanted again */
     uint8_t *interrupted;         /* (n_buses,) bool: frames were lost since the last batch */

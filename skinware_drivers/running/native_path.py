@@ -120,8 +120,6 @@ class PathHooks:
             "heard": lambda: self.listeners.heard(),
             "damaged": self._on_damage,
         }
-        if self._decoder.device_stamps.times:
-            called["tell_times"] = self._on_times
         if getattr(self._publisher.watch.look, "__func__", None) is not Watch.look:
             called["look"] = self._on_look
         kinds: dict[str, Any] = {field[0]: field[1] for field in structs.Hooks._fields_}
@@ -171,12 +169,6 @@ class PathHooks:
 
     def _on_data(self) -> None:
         self.listeners.hear(np.arange(max(self._batch.start, self._batch.headroom), self._batch.stop))
-
-    def _on_times(self) -> None:
-        batch = self._batch
-        new = slice(max(batch.start, batch.headroom), batch.stop)
-        module, kind = self.named(new)
-        self._decoder.device_stamps.apply(kind, module, batch.wire["payload"][new], batch.time_ns[new])
 
     def _on_offer(self, at: int, n: int) -> None:
         left = self.listeners.offer(_view(at, n, np.int64).copy())
@@ -351,9 +343,9 @@ class NativePath:
         for bus in np.flatnonzero(self._exchange.skipped).tolist():
             self._publisher.buses.counters[bus].updates_skipped += int(self._exchange.skipped[bus])
         self._exchange.skipped[:] = 0
-        if self._words.hastened:
-            self._words.hastened = 0
-            self._decoder.warn_of_haste()
+        if self._words.warns:
+            self._words.warns = 0
+            self._decoder.warn()
         error, self._hooks.error = self._hooks.error, None
         if error is not None:
             raise error

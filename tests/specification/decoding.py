@@ -20,6 +20,7 @@ from skinware_drivers.decoding.decoder import NONE_YET, PATCH_COUNTERS, Decoder,
 from skinware_drivers.description import SkinTables
 from skinware_drivers.fields import Byte, Flag, SequenceNumber
 from skinware_drivers.layout import Layout
+from tests.specification.device_time import DeviceStamps
 from tests.specification.pairing import Pairing
 from tests.specification.reading import name_modules, read_updates
 
@@ -112,6 +113,7 @@ class SpecifiedDecoder(Decoder):
     ) -> None:
         super().__init__(layouts, tables, periods_s)
         self.state = SpecifiedState(self.tables)
+        self.device_stamps = DeviceStamps(self)
         self._n_modules, self._n_patches = self.tables.structure.n_modules, self.tables.structure.n_patches
         self._pairings = [(cycle, Pairing(cycle)) for cycle in self.compiled.cycles]
         self._carried: tuple[npt.NDArray[Any], Indices, npt.NDArray[np.uint16]] | None = None
@@ -314,7 +316,7 @@ class SpecifiedDecoder(Decoder):
         haste = self.haste
         haste += np.bincount(self._module_patch[soon], minlength=self._n_patches)
         haste[self._module_patch[whole]] = np.minimum(haste[self._module_patch[whole]], 0)
-        self.warn_of_haste()
+        self.warn()
 
     def _carry(self, batch: FrameBatch, rows: Indices) -> None:
         kept = batch.wire[rows], batch.time_ns[rows], batch.bus[rows]

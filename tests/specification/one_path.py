@@ -181,9 +181,8 @@ class Way:
             "seen by the watch": repr(getattr(self.watch, "seen", None)),
             "own counters": repr([read_own(counters) for counters in publisher.buses.counters]),
             "desk": repr(vars(self.desk)) if self.desk is not None else "",
-            "device clocks": repr(
-                [(patch, sorted(vars(clock).items())) for patch, clock in sorted(decoder.device_stamps.clocks.items())]
-            ),
+            "knows_clock": decoder.knows_clock,
+            "clock_stops": decoder.clock_stops,
         }
         for number, cycle in enumerate(decoder.compiled.cycles):
             if cycle.punctuality is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Self
@@ -9,14 +10,15 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from skinware import native
 from skinware._columns import Index
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
+from skinware.native import give_arrays
 from skinware.structure import Structure
-from skinware.tactile.arrays import Bytes, Columns, Doubles, Flags, Floats, Whole, rows_of
-from skinware.tactile.neighbours import Components, area_m2, pitch_m
+from skinware.tactile.arrays import Arrays, Bytes, Columns, Flags, Floats, Whole, rows_of
+from skinware.tactile.neighbours import STRUCTS, Components, area_m2, pitch_m
 from skinware.tactile.neighbours import neighbours as neighbours_of
-from skinware.tactile.slips import Slips
 from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
 from skinware.tactile.tracks import TouchedBlobs
 
@@ -25,10 +27,9 @@ MOST = 64
 NO_CONTACT, BEYOND = -1, -2
 """Values of ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
 
-_CLEARLY = 1.5  # a contact must have so many times the load of one that is in the list to take its place
-_LEAST_SHARE = 0.1  # share of the newest frame in the value of a taxel that is just touched
-_LEAST_SEEN, _MOST_CUT = 0.5, 0.6
-"""Least share of a load that must be above the threshold, and largest share of clipped taxels, for an estimate."""
+_find, _list = native.core().quick.skinware_contacts_find, native.core().quick.skinware_contacts_list
+_find.argtypes, _find.restype = (ctypes.c_void_p,) * 2, None
+_list.argtypes, _list.restype = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_void_p), ctypes.c_int64
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,22 +196,32 @@ class Contacts:
             if given is not None and len(given) != n:
                 raise ConfigurationError(f"contacts of {n} taxels: the {what} are of {len(given)}")
         self._n = n
-        self._components = Components(n, neighbours, module)
         geometry = geometry if geometry is not None else Geometry.unknown([""] * n, np.zeros(n, np.uint64))
-        area = area_m2(geometry)
-        of_taxel = [geometry.position_m, geometry.normal, area[:, None], np.isfinite(area)[:, None]]
-        self._of_taxel = np.nan_to_num(np.hstack(of_taxel).astype(np.float64))  # place, normal, area, and whether known
-        self._unit = unit
-        self._least = 0.0  # value of a taxel that is just touched; 0: none was seen yet
-        known = np.isfinite(geometry.position_m).all(axis=1)
+        area, known = area_m2(geometry), np.isfinite(geometry.position_m).all(axis=1)
+        columns = [geometry.position_m, geometry.normal, area[:, None], np.isfinite(area)[:, None]]
+        of_taxel = np.nan_to_num(np.hstack(columns).astype(np.float64))
         names, number = np.unique(geometry.frame[known].astype(str), return_inverse=True)
         self.frames: tuple[str, ...] = tuple(names.tolist())
-        self._frame = np.full(n, -1, np.int64)
-        self._frame[known] = number
+        frame_of = np.full(n, -1, np.int64)
+        frame_of[known] = number
         pitch = pitch_m(geometry)
         median_m = float(np.nanmedian(pitch)) if np.isfinite(pitch).any() else np.nan
-        self._tracker = Tracker(self._of_taxel[:, :3], median_m, tracking)
-        self._slips = Slips(self._of_taxel[:, :3], median_m)
+        self._tracker = Tracker(of_taxel[:, :3], median_m, tracking)
+        own: Arrays = {"of_taxel": of_taxel, "frame_of": frame_of, "track_of": self._tracker.track_of}
+        self._words = words = STRUCTS["Contacts"]()
+        self._given = give_arrays(words, n, {}, own)
+        words.n, words.is_newtons, words.is_pascals = n, unit == "N", unit == "Pa"
+        components = Components(n, neighbours, module)
+        words.components = components.at
+        slips, found, listed = (STRUCTS[name]() for name in ("Slips", "Found", "Listed"))
+        words.slipping, words.found, words.listed = map(ctypes.addressof, (slips, found, listed))
+        patterns = [(STRUCTS["Pattern"] * MOST)() for _ in range(2)]
+        slips.patterns, slips.before = map(ctypes.addressof, patterns)
+        slips.n, slips.least_radius_m = n, float(np.nan_to_num(median_m)) / 6**0.5  # of a square as wide as the pitch
+        self._found = give_arrays(found, MOST, dict.fromkeys(_VECTORS, 3 * MOST))
+        rows = {name: np.zeros(shape, dtype) for name, (dtype, shape, *_) in rows_of(COLUMNS, MOST).items()}
+        self._listed = give_arrays(listed, MOST, {}, rows)
+        self._kept = components, slips, found, listed, patterns, give_arrays(slips, n, {})
 
     @classmethod
     def of(
@@ -264,119 +275,31 @@ class Contacts:
         if np.shape(value) != (self._n,) or np.shape(touched) != (self._n,):
             shapes = f"values of {np.shape(value)}, touched of {np.shape(touched)}"
             raise ConfigurationError(f"contacts of {self._n} taxels: {shapes}")
-        taxels = np.flatnonzero(touched if onset is None else touched | onset)
-        contact_of = np.full(self._n, NO_CONTACT, np.int16)
-        if not len(taxels) and self._tracker.rests(time_ns):
-            nothing = {name: np.zeros(shape, dtype) for name, (dtype, shape, *_) in rows_of(COLUMNS, 0).items()}
-            return ContactSet(contact_of=contact_of, beyond=0, frames=self.frames, **nothing)
-        contact, count = self._components.of(taxels)
-        load = value[taxels].astype(np.float64)
-        load = np.where(np.isfinite(load) & (load > 0), load, 0.0)
-        beyond = max(0, count - MOST)
-        if beyond:
-            contact_of[taxels] = BEYOND
-            listed = self._tracker.track_of[taxels] >= 0
-            taxels, contact, load = _largest(taxels, contact, load, count, listed)
-            count = MOST
-        found = self._measure(taxels, contact, load, count)
-        is_sure, frames = np.ones(count, bool), np.ones(count, np.int64)
-        if onset is not None:
-            is_sure = np.bincount(contact, touched[taxels], count) > 0
-            frames += np.bincount(contact, onset[taxels], count) > 0
-        blobs = TouchedBlobs(
-            taxels, contact, load, found["load"], found["peak"], found["frame"], found["cop_m"], is_sure, frames
-        )
-        cut = np.zeros(count)
-        if clipped is not None:
-            cut += np.bincount(contact, clipped[taxels], count)
-        unsure = np.full(count, np.nan) if uncertainty is None else np.bincount(contact, uncertainty[taxels], count)
-        found |= {"clipped": cut, "uncertainty": unsure, "load_whole": self._whole(found, cut, load)}
-        found |= self._tracker.follow(blobs, time_ns)
-        order = np.lexsort([found["id"], -found["age_s"]])
-        order = order[found["id"][order] > 0]
-        row = np.full(count, NO_CONTACT)
-        row[order] = np.arange(len(order))
-        contact_of[taxels] = row[contact]
-        found["slips"] = np.zeros(count, bool)
-        if sigmas is not None:
-            found["slips"][order] = self._slipping(
-                found["id"][order], found["frame"][order], contact_of, sigmas, time_ns
+        contact_of = np.empty(self._n, np.int16)
+        words, at, to = self._words, ctypes.addressof(self._words), contact_of.ctypes.data
+        for name, array in (("onset", onset), ("clipped", clipped), ("uncertainty", uncertainty), ("sigmas", sigmas)):
+            setattr(words, f"has_{name}", array is not None)
+            if array is not None:
+                self._given[name][:] = array
+        self._given["value"][:], self._given["touched"][:] = value, touched
+        _find(at, to)
+        count, most = words.count, 0
+        if words.n_touched or not self._tracker.rests(time_ns):
+            found = self._found
+            of_taxel, m = self._given, words.n_touched
+            blobs = TouchedBlobs(
+                of_taxel["taxels"][:m],
+                of_taxel["contact"][:m],
+                of_taxel["load_of"][:m],
+                found["load"][:count],
+                found["peak"][:count],
+                found["frame"][:count],
+                found["cop_m"].reshape(-1, 3)[:count],
+                found["is_sure"][:count],
+                found["frames"][:count],
             )
-        columns = {name: found[name][order].astype(dtype) for name, (dtype, *_) in COLUMNS.items()}
-        return ContactSet(contact_of=contact_of, beyond=beyond, frames=self.frames, **columns)
-
-    def _slipping(
-        self, identity: Whole, frame: Whole, contact_of: npt.NDArray[np.int16], sigmas: npt.NDArray[Any], time_ns: int
-    ) -> Flags:
-        """(m,) which of the m contacts that have rows slip."""
-        taxels = np.flatnonzero(contact_of >= 0)
-        contact = contact_of[taxels].astype(np.int64)
-        counts = (frame[contact] == self._frame[taxels]) & (frame[contact] >= 0) & np.isfinite(sigmas[taxels])
-        return self._slips.update(identity, taxels[counts], contact[counts], sigmas, time_ns)
-
-    def _measure(self, taxels: Whole, contact: Whole, load: Doubles, count: int) -> dict[str, npt.NDArray[Any]]:
-        order = np.argsort(contact, kind="stable")
-        taxels, contact, load = taxels[order], contact[order], load[order]
-        first = np.searchsorted(contact, np.arange(count))  # each contact has at least one taxel
-        peak = np.maximum.reduceat(load, first) if count else np.zeros(0)
-        frame = self._frame_of(taxels, contact, load, peak)
-        of_taxel = self._of_taxel[taxels]
-        counts = (frame[contact] == self._frame[taxels]) & (frame[contact] >= 0)
-        weight = np.where(counts, load, 0.0)
-        if count:  # without any load, each taxel weighs the same
-            weight += counts * (np.add.reduceat(weight, first) == 0)[contact]
-        parts = np.column_stack(
-            [load, load * of_taxel[:, 6], weight, of_taxel[:, 6:], weight[:, None] * of_taxel[:, :6]]
-        )
-        total = np.add.reduceat(parts, first, axis=0) if count else np.zeros((0, parts.shape[1]))
-        loads, forces, weights, areas, with_area = total[:, :5].T
-        has_area, normal = with_area > 0, total[:, 8:]
-        length = np.sqrt((normal**2).sum(axis=1))
-        return {
-            "load": loads,
-            "peak": peak,
-            "n": np.bincount(contact, minlength=count),
-            "area_m2": np.where(has_area, areas, np.nan),
-            "force_n": {"N": loads, "Pa": np.where(has_area, forces, np.nan)}.get(self._unit, np.full(count, np.nan)),
-            "cop_m": total[:, 5:8] / np.where(weights > 0, weights, np.nan)[:, None],
-            "normal": normal / np.where(length > 0, length, np.nan)[:, None],
-            "frame": frame,
-        }
-
-    def _whole(self, found: dict[str, npt.NDArray[Any]], cut: Doubles, load: Doubles) -> Doubles:
-        """(count,) the loads of bells of which only the part above the threshold and below the clipping was seen."""
-        if len(load) and (load > 0).any():
-            least = float(load[load > 0].min())
-            self._least = least if not self._least else self._least + _LEAST_SHARE * (least - self._least)
-        peak, share = np.maximum(found["peak"], self._least), cut / found["n"]
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            seen = 1 - self._least / peak
-            whole = np.where(seen >= _LEAST_SEEN, found["load"] / seen, np.nan)
-            if not cut.any():
-                return whole
-            top = (peak / self._least**share) ** (1 / (1 - share))
-            of_cut = found["n"] * top / np.log(top / self._least)
-        return np.where(cut > 0, np.where(share <= _MOST_CUT, of_cut, np.nan), whole)
-
-    def _frame_of(self, taxels: Whole, contact: Whole, load: Doubles, peak: Doubles) -> Whole:
-        """(count,) the frame in which each contact has its largest value; -1 if no place is known."""
-        placed = self._frame[taxels] >= 0
-        if not placed.all():  # the largest value at a known place
-            peak = np.full(len(peak), -1.0)
-            np.maximum.at(peak, contact[placed], load[placed])
-        is_largest = placed & (load == peak[contact])
-        frame = np.full(len(peak), -1)
-        frame[contact[is_largest]] = self._frame[taxels[is_largest]]
-        return frame
-
-
-def _largest(taxels: Whole, contact: Whole, load: Doubles, count: int, listed: Flags) -> tuple[Whole, Whole, Doubles]:
-    """Those of the largest contacts; one that was listed stays unless another is clearly larger."""
-    loads = np.bincount(contact, load, count)
-    loads *= np.where(np.bincount(contact, listed, count) > 0, _CLEARLY, 1.0)
-    kept = np.sort(np.argsort(-loads, kind="stable")[:MOST])
-    number = np.full(count, -1)
-    number[kept] = np.arange(MOST)
-    number = number[contact]
-    is_kept = number >= 0
-    return taxels[is_kept], number[is_kept], load[is_kept]
+            for name, array in self._tracker.follow(blobs, time_ns).items():
+                found[name][: array.size] = array.reshape(-1)
+            most = _list(at, time_ns, to)
+        columns = {name: self._listed[name][:most].copy() for name in COLUMNS}
+        return ContactSet(contact_of=contact_of, beyond=words.beyond, frames=self.frames, **columns)

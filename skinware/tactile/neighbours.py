@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware import native
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
-from skinware.tactile.arrays import Doubles, Flags, Whole
+from skinware.native import give_arrays, read_structs
+from skinware.tactile.arrays import Arrays, Doubles, Flags, Whole
+
+STRUCTS = read_structs([Path(native.__file__).with_name("contacts.h")])
+"""The structs of contacts.h."""
+_components = native.core().quick.skinware_components
+_components.argtypes = ctypes.c_void_p, ctypes.c_int64, *(ctypes.c_void_p,) * 2
+_components.restype = ctypes.c_int64
 
 NONE = -1
 """Fills up the rows of a table."""
@@ -240,6 +250,9 @@ class Components:
         neighbours: (n, k) int, -1 fills its rows; None: not known.
         module: (n,) int, the module of each taxel.
 
+    Attributes:
+        at: address of its ``struct components``, for C.
+
     Raises:
         ConfigurationError: the table is not one of n taxels.
     """
@@ -247,43 +260,24 @@ class Components:
     def __init__(self, n: int, neighbours: npt.NDArray[Any] | None, module: npt.NDArray[Any] | None = None) -> None:
         table = np.zeros((n, 0), np.int32) if neighbours is None else checked(neighbours, n)
         row, column = np.nonzero(table > np.arange(n)[:, None])
-        self._forward = _filled(row, table[row, column], n)  # each pair once, in the row of the lower number
-        self._is_lonely = (table == NONE).all(axis=1)
-        self._module = module if self._is_lonely.any() else None
-        self._position = np.full(n + 1, NONE, np.int32)  # among those that are touched; the last one is that of NONE
+        forward = _filled(row, table[row, column], n)  # each pair once, in the row of the lower number
+        lonely, of_module = np.flatnonzero((table == NONE).all(axis=1)), np.full(n, NONE, np.int64)
+        if module is not None:
+            of_module[lonely] = np.unique(module[lonely], return_inverse=True)[1]
+        given: Arrays = {"forward": forward, "module": of_module, "root": np.full(n, NONE, np.int64)}
+        given["first"] = np.full(int(of_module.max(initial=NONE)) + 1, NONE, np.int64)
+        self._words = words = STRUCTS["Components"]()
+        words.n, words.width = n, forward.shape[1]
+        self._kept = give_arrays(words, n, {}, given)
+        self.at: int = ctypes.addressof(words)
 
     def of(self, touched: Whole) -> tuple[Whole, int]:
         """Return (m,) int64 the component of each of m taxels, counted from 0 in their order; and their number.
 
         ``touched`` is (m,) int64, ascending.
         """
-        self._position[touched] = np.arange(len(touched))
-        beside = self._position[self._forward[touched]].reshape(-1)
-        self._position[touched] = NONE
-        pair = np.flatnonzero(beside != NONE)
-        one, other = pair // max(1, self._forward.shape[1]), beside[pair].astype(np.int64)
-        if self._module is not None:
-            lonely = np.flatnonzero(self._is_lonely[touched])
-            _, first, module = np.unique(self._module[touched[lonely]], return_index=True, return_inverse=True)
-            one, other = np.concatenate([one, lonely[first][module]]), np.concatenate([other, lonely])
-        root = _roots(len(touched), one, other)
-        is_root = root == np.arange(len(touched))
-        number = np.cumsum(is_root) - 1
-        return number[root], int(is_root.sum())
-
-
-def _roots(count: int, low: Whole, high: Whole) -> Whole:
-    """(count,) int64: the smallest member of the component of each, for edges from ``low`` to higher numbers."""
-    root = np.arange(count)
-    while len(low):
-        np.minimum.at(root, high, low)
-        while not np.array_equal(root, upper := root[root]):
-            root = upper
-        one, other = root[low], root[high]
-        apart = one != other
-        one, other = one[apart], other[apart]
-        low, high = np.minimum(one, other), np.maximum(one, other)
-    return root
+        given, found = np.ascontiguousarray(touched, np.int64), np.zeros(len(touched), np.int64)
+        return found, int(_components(self.at, len(given), given.ctypes.data, found.ctypes.data))
 
 
 def without_holes(touched: Flags, neighbours: npt.NDArray[Any]) -> Flags:

@@ -89,8 +89,11 @@ class ConfigFile:
             return
         data = self._text.data
         try:
-            _check_keys(DriverConfig, data)
-            for number, bus in enumerate(data["bus"] if isinstance(data.get("bus"), list) else []):
+            _check_keys(DriverConfig, data, hint="; options of the driver belong below [options]")
+            buses = data.get("bus", [])
+            if not isinstance(buses, list) or not all(isinstance(bus, Mapping) for bus in buses):
+                raise _Wrong('each bus is a table: a line [[bus]], and below it a line such as name = "can0"', ("bus",))
+            for number, bus in enumerate(buses):
                 _check_keys(BusConfig, bus, ("bus", number))
             settings = _convert(DriverConfig, data)
         except _Wrong as wrong:
@@ -160,9 +163,9 @@ def _convert(struct: type[T], data: Mapping[str, Any]) -> T:
         raise _Wrong(str(error.__cause__) if isinstance(error.__cause__, ConfigurationError) else text, keys) from None
 
 
-def _check_keys(struct: type[msgspec.Struct], data: object, place: Keys = ()) -> None:
+def _check_keys(struct: type[msgspec.Struct], data: object, place: Keys = (), hint: str = "") -> None:
     known = [field.encode_name for field in msgspec.structs.fields(struct)]
     for key in data if isinstance(data, Mapping) else ():
         if key not in known:
             of_bus = f"bus {place[1] + 1}: " if len(place) > 1 and isinstance(place[1], int) else ""
-            raise _Wrong(f"{of_bus}unknown key {key!r}{nearest_name(key, sorted(known))}", (*place, key))
+            raise _Wrong(f"{of_bus}unknown key {key!r}{nearest_name(key, sorted(known))}{hint}", (*place, key))

@@ -69,7 +69,8 @@ def test_the_line_of_a_value(keys: Keys, line: int) -> None:
         ('\n[[bus]]\nname = ""', "{file}:2: a bus has no name yet"),
         ("\n\ncpus = [1,\n-1]", "{file}:1: "),
         ("[[bus]]\nnam = 1", "{file}:2: bus 1: unknown key 'nam'; did you mean 'name'"),
-        ("bus = 3", "{file}:1: Expected array, got int - at $.bus"),
+        ("bus = 3", "{file}:1: each bus is a table: a line [[bus]], and below it a line such as name = "),
+        ("wait = true\nbus = ['can0']", "{file}:2: each bus is a table"),
         ("x = =", "{file}:1: not TOML: Invalid value"),
     ],
 )
@@ -79,6 +80,13 @@ def test_a_mistake_in_a_file(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as raised:
         ConfigFile(file)
     assert str(raised.value).startswith(message.format(file=file))
+
+
+def test_an_option_of_the_driver_outside_its_table(tmp_path: Path) -> None:
+    file = tmp_path / "torso.toml"
+    file.write_text("boards = [7]")
+    with pytest.raises(ConfigurationError, match=r"torso.toml:1: unknown key 'boards'.* belong below \[options\]"):
+        ConfigFile(file)
 
 
 @pytest.mark.parametrize(

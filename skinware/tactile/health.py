@@ -29,7 +29,6 @@ from skinware.tactile.health_relations import Copies, Dropouts, Twins, median_ar
 from skinware.tactile.neighbours import Table, neighbours
 
 _CLEAR = 8.0  # times the noise: a touch this high is no flicker
-_HARD = 0.25  # share of what a taxel usually shows at most: less is the rest of a touch, and no other touch
 _LEAST_NOISE = 0.5  # steps of the values: no taxel counts as quieter
 _ALIKE = 0.9  # correlation with the touches of another taxel, from which a taxel shows them
 _SAME = 0.7  # part of another's touches, from which both are shorted
@@ -225,13 +224,15 @@ class Health:
         self._neighbours: Table = np.zeros((n, 0), np.int32) if geometry is None else neighbours(geometry)
         self._begun_ns: int | None = None
         self._now_s = 0.0
-        self._noise = Noise(n, self.settings.noise_s)
-        self._use = Use(self._module, self.settings.touches)
+        self._use = Use(self._module, self.settings.touches, limits)
+        self._noise = Noise(self._use.arrays["sums"].reshape(3, n), self.settings.noise_s)
         self._dues = Dues(geometry, self._neighbours)
         self._dropouts = Dropouts(self._neighbours)
-        self._copies, self._twins = Copies(self._module, self._neighbours), Twins(self._neighbours)
+        self._copies, self._twins = (
+            Copies(self._module, self._neighbours, self._use.arrays["total"]),
+            Twins(self._neighbours),
+        )
         self._clear = _CLEAR * self._least_noise  # a touch above it is clear
-        self._is_misled = np.zeros(n, bool)  # shows touches of others, which says nothing of taxels beside it
 
     @classmethod
     def of(cls, structure: Structure, type_name: str, settings: HealthSettings | None = None) -> Self:
@@ -255,22 +256,24 @@ class Health:
         given = np.asarray(values, np.float32)
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)
-        far = np.fmax(np.float32(_CLEAR) * calm.noise, np.float32(self._clear))
-        free = calm.usable & ~calm.touched & (given <= calm.baseline + far)
-        at_end = self._is_at_end(given)
-        if self._noise.add(self._now_s, given - self._use.value, at_end, free):
+        use = self._use
+        has_moved = use.compare(given, calm, self._clear)
+        if self._noise.ends(self._now_s):
             self._clear = _CLEAR * self._typical_noise()
             self._dropouts.forget(self.settings.noise_s)
             shown = self._dues.share_shown(self.settings.touches)
             self._dues.exchanges.watch(np.flatnonzero(shown < self.settings.weak))
-            self._is_misled = self._related(shown)[0] > 0
-        self._dropouts.add(self._now_s, self._use.value, given, at_end, calm, far)
-        self._use.add(self._now_s, self._now_s - before_s, given, calm)
-        hard = self._use.touched & (calm.value > np.maximum(self._clear, _HARD * self._use.usual)) & ~self._is_misled
-        above = given - calm.baseline
-        self._dues.add(self._now_s, above, calm, hard)
-        self._copies.add(self._now_s, given, calm.usable, self._clear / _CLEAR)
-        self._twins.add(self._now_s, above, calm, self._clear / _CLEAR)
+            use.arrays["misled"][:] = self._related(shown)[0] > 0
+        if has_moved:
+            self._dropouts.add(self._now_s, use.arrays, calm)
+        is_hard, is_plain = use.take(self._now_s, self._now_s - before_s, self._clear)
+        above, noise = use.arrays["above"], self._clear / _CLEAR
+        self._dues.frames += 1
+        if is_hard:
+            self._dues.add(self._now_s, above, calm, use.arrays["hard"])
+        self._copies.add(self._now_s, noise)
+        if is_plain:
+            self._twins.add(self._now_s, above, use.arrays["plain"], calm, noise)
 
     def report(self) -> HealthReport:
         """Judge the taxels; meant for once a second or so."""

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from skinware import native
 from skinware.geometry import Geometry
+from skinware.native import give_arrays, read_structs
 from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
 from skinware.tactile.baseline import Calm
 from skinware.tactile.health_relations import APART_S, KEPT, Exchanges
 from skinware.tactile.neighbours import NONE, Table, pitch_m
+
+_STRUCTS = read_structs([Path(native.__file__).with_name("health.h")])
+_compare, _use = native.core().quick.skinware_health_compare, native.core().quick.skinware_health_use
+_compare.argtypes, _compare.restype = (ctypes.c_void_p,), ctypes.c_int64
+_use.argtypes, _use.restype = (ctypes.c_void_p, ctypes.c_double, ctypes.c_double), ctypes.c_int64
+_BEGUN, _HARD, _PLAIN = 2, 4, 8
 
 _PARTS = 9  # of a measurement of noise
 _GROWTH = 1.2  # times: a noise grows by at most this from one measurement to the next
@@ -36,32 +46,22 @@ class Noise:
     A measurement has parts, and the noise is that of its median part: a press nearby makes differences only in some of
     them, and so does the release of a load under which a baseline was taken. A noise grows slowly, as presses may be in
     most of them. ``deviation`` and ``at_end``, the share of the time at an end of the range, are NaN before they are
-    known.
+    known. ``sums`` are (3, n), of squared differences, of frames, and of frames at an end of the range, of the present
+    part: of taxels that are neither touched nor far above their baselines, as at the beginning of a touch.
     """
 
-    def __init__(self, n: int, measured_s: float) -> None:
+    def __init__(self, sums: Floats, measured_s: float) -> None:
+        n = sums.shape[1]
         self.deviation: Floats = np.full(n, np.nan, np.float32)
         self.at_end: Floats = np.full(n, np.nan, np.float32)
         self._part_s = measured_s / _PARTS
         self._begun_s, self._ended = 0.0, 0
-        self._was_free: Flags = np.zeros(n, bool)
-        self._sums: Floats = np.zeros((3, n), np.float32)
-        """Sums of squared differences, of frames, and of frames at an end of the range, of the present part."""
+        self._sums = sums
         self._squares, self._ends = np.full((2, _PARTS, n), np.nan, np.float32)
         self._n_parts: Whole = np.zeros(n, np.int64)
 
-    def add(self, now_s: float, difference: Floats, at_end: Flags, free: Flags) -> bool:
-        """Take in the difference from the frame before; return whether a measurement ends with it.
-
-        Taxels are free that are neither touched nor far above their baselines, as at the beginning of a touch.
-        """
-        both = free & self._was_free
-        self._was_free = free
-        difference = np.where(both, difference, np.float32(0))
-        squares, frames, ends = self._sums
-        squares += difference * difference
-        frames += both
-        ends += both & at_end
+    def ends(self, now_s: float) -> bool:
+        """Return whether a measurement ends with the newest frame."""
         if now_s - self._begun_s < self._part_s:
             return False
         self._begun_s = now_s
@@ -85,44 +85,50 @@ class Noise:
 
 
 class Use:
-    """Follows when n taxels changed, and how hard they and their modules were touched.
+    """Follows when n taxels changed, and how hard they and their modules were touched; each frame in C.
 
-    ``usual`` is the ``peak`` that a touch showed, less of it with each touch. ``module_touched_s`` has the times of the
-    last touches of each module, (n_modules, touches), the oldest first.
+    The arrays are (n,), as ``skinware/native/health.h`` describes them. ``module_touched_s`` has the times of the last
+    touches of each module, (n_modules, touches), the oldest first.
     """
 
-    def __init__(self, module: npt.NDArray[np.intp], touches: int) -> None:
+    def __init__(self, module: npt.NDArray[np.intp], touches: int, limits: tuple[float, float]) -> None:
         n = len(module)
-        self._module = module
-        self.seen: Flags = np.zeros(n, bool)
-        self.value: Floats = np.full(n, np.nan, np.float32)
-        self.changed_s: Doubles = np.zeros(n)
-        self.touched: Flags = np.zeros(n, bool)
-        self.peak: Floats = np.zeros(n, np.float32)
-        self.usual: Floats = np.zeros(n, np.float32)
+        self._module, self._words = module, _STRUCTS["Health"]()
+        self._words.n = n
+        self._words.least, self._words.most = limits
+        self.arrays = give_arrays(self._words, n, {"sums": 3 * n})
+        self.value: Floats = self.arrays["value"]
+        self.value[:] = np.nan
+        self.changed_s: Doubles = self.arrays["changed_s"]
+        self.seen: Flags = self.arrays["seen"]
+        self.touched: Flags = self.arrays["touched"]
+        self.peak: Floats = self.arrays["peak"]
+        self.usual: Floats = self.arrays["usual"]
         self.module_touched_s = np.full((int(module.max(initial=-1)) + 1, touches), -math.inf)
+        self._at = ctypes.addressof(self._words)
 
-    def add(self, now_s: float, passed_s: float, given: Floats, calm: Calm) -> None:
-        """Take the next frame in; time without data does not count as time without change."""
-        usable = calm.usable
-        changed = usable & (given != self.value)
-        np.copyto(self.changed_s, now_s, where=changed)
-        if not usable.all():
-            self.changed_s += passed_s * ~usable
-        np.copyto(self.value, given, where=changed)
-        self.seen |= usable
-        touched = calm.touched & usable
-        active = np.flatnonzero(touched)
-        begun = active[~self.touched[active]]
-        self.touched = touched
-        self.usual[begun] *= KEPT
-        for most in (self.peak, self.usual):
-            most[active] = np.maximum(most[active], calm.value[active])
-        if len(begun):
-            module = np.unique(self._module[begun])
+    def compare(self, given: Floats, calm: Calm, clear: float) -> bool:
+        """Compare the next frame with the values before it; a touch above ``clear`` is clear.
+
+        Returns:
+            Whether a taxel has jumped: ``moved``.
+        """
+        arrays = self.arrays
+        arrays["given"][:], arrays["load"][:], arrays["baseline"][:] = given, calm.value, calm.baseline
+        arrays["noise"][:], arrays["calm_touched"][:], arrays["usable"][:] = calm.noise, calm.touched, calm.usable
+        self._words.clear = clear
+        return bool(_compare(self._at))
+
+    def take(self, now_s: float, passed_s: float, clear: float) -> tuple[bool, bool]:
+        """Take the frame in; return whether there are hard touches, and plain ones."""
+        self._words.clear = clear
+        found = _use(self._at, now_s, passed_s)
+        if found & _BEGUN:
+            module = np.unique(self._module[self.arrays["begun"]])
             last = self.module_touched_s[module]
             module, last = (of[now_s - last[:, -1] >= _MODULE_APART_S] for of in (module, last))
             self.module_touched_s[module] = np.column_stack([last[:, 1:], np.full(len(module), now_s)])
+        return bool(found & _HARD), bool(found & _PLAIN)
 
 
 class Dues:
@@ -134,6 +140,7 @@ class Dues:
         recent: the mean share of the last hard touches, each with the same weight.
         best: the largest of these means so far, at most 1; 0 before it is known well.
         exchanges: weak taxels that show what is due to others.
+        frames: number of frames so far.
     """
 
     def __init__(self, geometry: Geometry | None, table: Table) -> None:
@@ -142,20 +149,19 @@ class Dues:
         self.recent, self.best = np.zeros((2, n))
         self.hard_touches: Whole = np.zeros(n, np.int64)
         self._pairs = None if geometry is None else Pairs(geometry, table)
-        self._frames = 0
+        self.frames = 0
         self.due, self.shown = np.zeros(n), np.zeros(n)
         self.touches: Whole = np.zeros(n, np.int64)
         self._hardest_due, self._hardest_shown = np.zeros(n), np.zeros(n)
         self._compared_s = np.full(n, -math.inf)
 
     def add(self, now_s: float, above: Floats, calm: Calm, hard: Flags) -> None:
-        """Take the next frame in: its values above the baselines, and which taxels are clearly touched."""
-        self._frames += 1
+        """Take a frame with clear touches in: its values above the baselines, and which taxels are clearly touched."""
         if self._pairs is None:
             return
         active = np.flatnonzero(hard)
         step = len(active) // _MOST_AT_ONCE + 1
-        middle, one, other = self._pairs.around(active[self._frames % step :: step], hard)
+        middle, one, other = self._pairs.around(active[self.frames % step :: step], hard)
         if not len(middle):
             return
         self._end_touches(np.unique(middle[now_s - self._compared_s[middle] >= APART_S]))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.tactile.arrays import Doubles, Flags, Floats, Whole
+from skinware.tactile.arrays import Arrays, Doubles, Flags, Floats, Whole
 from skinware.tactile.baseline import Calm
 from skinware.tactile.neighbours import NONE, Table
 
@@ -19,9 +19,7 @@ APART_S = 1.0
 _FEWEST_AROUND = 3  # neighbours with a known share that a comparison with neighbours needs
 _MOST_EXCHANGED = 64  # weak taxels that are compared with each other
 _MOST_COMPARED = 1024  # touched taxels that are compared with their neighbours in one frame
-_PLAIN = 24.0  # times the noise: weaker touches do not show whether two taxels are the same
 _STEADY = 0.25  # share of a jump: neighbours that change less have not felt it
-_STILL_FRAMES = 5  # frames without a large change before a value is lost: noise is large in each
 _BACK = 0.2  # share of a jump: the value is back if it differs by less from the one before
 _LOST_S = 2.0  # seconds: what lasts longer is no dropout
 _FORGET_S = 600.0  # seconds in which half of the dropouts are forgotten
@@ -65,17 +63,12 @@ class Dropouts:
         self._table = table
         self.count: Floats = np.zeros(len(table), np.float32)
         self._lost_s = np.full(len(table), -math.inf)
-        self._still: Whole = np.zeros(len(table), np.int64)
         self._before, self._lost = np.zeros((2, len(table)), np.float32)
 
-    def add(self, now_s: float, before: Floats, given: Floats, at_end: Flags, calm: Calm, far: Floats) -> None:
-        """Take the next frame in; ``far`` from its baseline, a difference is no noise."""
-        jump = np.abs(given - before)
-        was_still = self._still >= _STILL_FRAMES
-        self._still = np.where(jump <= far, self._still + 1, 0)
-        moved = np.flatnonzero((jump > 2 * far) & calm.usable)
-        if not len(moved):
-            return
+    def add(self, now_s: float, arrays: Arrays, calm: Calm) -> None:
+        """Take in a frame in which some have moved, by the arrays of ``struct health``."""
+        before, given, jump, far = (arrays[name] for name in ("value", "given", "jump", "far"))
+        moved = np.flatnonzero(arrays["moved"])
         moved = moved[_most_around(self._table, moved, jump) <= _STEADY * jump[moved]]
         back = (now_s - self._lost_s[moved] <= _LOST_S) & (
             np.abs(given[moved] - self._before[moved])
@@ -87,7 +80,9 @@ class Dropouts:
         around = self._table[moved]
         is_beside = (calm.touched[around] & (around != NONE)).any(axis=1)  # a touch that they still feel
         drops = (given[moved] < (rest + before[moved]) / 2) & is_beside
-        lost = moved[~back & was_still[moved] & (at_end[moved] | drops | (given[moved] < rest - far[moved]))]
+        lost = moved[
+            ~back & arrays["was_still"][moved] & (arrays["at_end"][moved] | drops | (given[moved] < rest - far[moved]))
+        ]
         self._lost_s[lost], self._before[lost], self._lost[lost] = now_s, before[lost], given[lost]
 
     def forget(self, passed_s: float) -> None:
@@ -149,21 +144,20 @@ class Exchanges:
 class Copies:
     """Finds taxels that change with another of their module, while their own neighbours do not.
 
-    Changes are those of means over some frames, from what the neighbours do: a cover sags round a touch.
+    Changes are those of means over some frames, from what the neighbours do: a cover sags round a touch. ``total`` is
+    (n,), the sum of the values so far, which begins again with each mean.
     """
 
-    def __init__(self, module: npt.NDArray[np.intp], table: Table) -> None:
-        self._module, self._table = module, table
+    def __init__(self, module: npt.NDArray[np.intp], table: Table, total: Floats) -> None:
+        self._module, self._table, self._sum = module, table, total
         self._is_known: Flags = (table != NONE).any(axis=1)
-        self._sum: Floats = np.zeros(len(table), np.float32)
         self._frames = 0
         self._before: Floats = np.full(len(table), np.nan, np.float32)
         self._before_s = -math.inf
         self._alone: dict[int, _Alone] = {}
 
-    def add(self, now_s: float, given: Floats, usable: Flags, noise: float) -> None:
-        """Take the next frame in; ``noise`` is that of the typical taxel."""
-        self._sum += np.where(usable, given, np.float32(np.nan))
+    def add(self, now_s: float, noise: float) -> None:
+        """Take in that ``total`` has another frame; ``noise`` is that of the typical taxel."""
         self._frames += 1
         if now_s - self._before_s < _CHANGE_S:
             return
@@ -261,10 +255,10 @@ class Twins:
         self.touches: Whole = np.zeros(len(table), np.int64)
         self._compared_s = np.full(len(table), -math.inf)
 
-    def add(self, now_s: float, above: Floats, calm: Calm, noise: float) -> None:
-        """Take the next frame in: its values above the baselines, and the noise of the typical taxel."""
-        rows = np.flatnonzero(calm.touched & (above > _PLAIN * noise))[:_MOST_COMPARED]
-        if not len(rows) or not self._table.shape[1]:
+    def add(self, now_s: float, above: Floats, plain: Flags, calm: Calm, noise: float) -> None:
+        """Take in a frame with plain touches: its values above the baselines, and the noise of the typical taxel."""
+        rows = np.flatnonzero(plain)[:_MOST_COMPARED]
+        if not self._table.shape[1]:
             return
         around = self._table[rows]
         is_there = (around != NONE) & calm.usable[around]

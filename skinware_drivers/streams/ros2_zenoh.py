@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
@@ -95,6 +96,7 @@ class ZenohPort(TopicPort):
         self._sequences: dict[str, tuple[bytes, int]] = {}
         self._ends: list[Callable[[], None]] = []
         self._event = -1
+        self._waking = threading.Lock()  # zenoh's threads may still wake what is being closed
         try:
             self._link = Link(graph_endpoints(options.router))
         except BridgeError as error:
@@ -157,8 +159,9 @@ class ZenohPort(TopicPort):
     def close(self) -> None:
         if self._event >= 0:
             self._link.close()
-            os.close(self._event)
-            self._event = -1
+            with self._waking:
+                os.close(self._event)
+                self._event = -1
 
     def _sample(self, key: str, attachment: bytes, payload: bytes) -> None:
         """Keep a sample; called in threads of zenoh."""
@@ -171,5 +174,6 @@ class ZenohPort(TopicPort):
         self._wake()
 
     def _wake(self) -> None:
-        if self._event >= 0:
-            os.eventfd_write(self._event, 1)
+        with self._waking:
+            if self._event >= 0:
+                os.eventfd_write(self._event, 1)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import threading
+import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -202,3 +205,24 @@ def test_emulated_devices_are_refused() -> None:
 def test_tokens_of_no_publisher(token: str) -> None:
     with pytest.raises(ValueError, match="no token of a publisher"):
         publisher_of(token)
+
+
+def test_nothing_is_closed_while_a_thread_of_zenoh_wakes_it(at: Router, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its number may be another file's the next moment."""
+    waking, link_closed = threading.Event(), threading.Event()
+
+    def slow_write(fd: int, _value: int) -> None:
+        waking.set()
+        link_closed.wait()
+        time.sleep(0.05)  # it must not be closed in this time, nor later
+        os.fstat(fd)
+
+    with joined(at, 0, _topics("/touch")) as port, ThreadPoolExecutor() as pool:
+        end_link = port._link.close
+        monkeypatch.setattr(port._link, "close", lambda: (end_link(), link_closed.set()))
+        monkeypatch.setattr(os, "eventfd_write", slow_write)
+        woken = pool.submit(port._wake)
+        waking.wait()
+        port.close()
+        woken.result()
+    assert port.fileno() == -1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -217,13 +218,15 @@ class Ros2Server:
         self._troubles: set[str] = set()
         self._diagnostics = node.publisher("/diagnostics", messages.DIAGNOSTICS, Qos())
         self._stopping = False
+        self._turning = threading.RLock()  # readers are for one thread at a time
 
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
         """Run until ``stop``; call ``each_second`` once a second."""
         second_ns = now_ns() + NS_PER_S
         with short_turns():
             while not self._stopping:
-                words, until_ns = self._take_all(min(now_ns() + WAIT_SLICE_NS, second_ns))
+                with self._turning:
+                    words, until_ns = self._take_all(min(now_ns() + WAIT_SLICE_NS, second_ns))
                 if now_ns() >= second_ns:
                     second_ns = max(second_ns + NS_PER_S, now_ns())
                     if self._diagnostics.is_wanted:
@@ -247,16 +250,17 @@ class Ros2Server:
         self._live.close()
 
     def drivers(self) -> Mapping[str, ServedReport]:
-        """Return the state of all drivers that were found at any time, by name."""
+        """Return the state of all drivers that were found at any time, by name; from any thread."""
         reports = {}
-        for name, served in self._served.items():
-            live, traffic = self._live.get(name), (served.missed, served.topics.messages, served.topics.left_out)
-            if live is None:
-                reports[name] = ServedReport(GONE, 0.0, None, *traffic)
-                continue
-            report = live.report()
-            age_ms = None if report.age_ns is None else report.age_ns / 1e6
-            reports[name] = ServedReport(report.life, report.rate_hz, age_ms, *traffic)
+        with self._turning:
+            for name, served in self._served.items():
+                live, traffic = self._live.get(name), (served.missed, served.topics.messages, served.topics.left_out)
+                if live is None:
+                    reports[name] = ServedReport(GONE, 0.0, None, *traffic)
+                    continue
+                report = live.report()
+                age_ms = None if report.age_ns is None else report.age_ns / 1e6
+                reports[name] = ServedReport(report.life, report.rate_hz, age_ms, *traffic)
         return reports
 
     # -- frames ---------------------------------------------------------------------------------------------------

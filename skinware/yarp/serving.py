@@ -204,7 +204,10 @@ class YarpServer:
         self._collector.close()
 
     def ports(self) -> dict[str, dict[str, Any]]:
-        """Return the state of each port: driver, whether it is registered, messages so far, values, and readers."""
+        """Return the state of each port: driver, whether it is registered, messages so far, values, and readers.
+
+        It may be called from any thread.
+        """
         return {
             name: {
                 "driver": served.driver,
@@ -216,7 +219,7 @@ class YarpServer:
                     for r in tuple(served.port.receivers)
                 ],
             }
-            for name, served in self._ports.items()
+            for name, served in self._ports.copy().items()
         }
 
     # -- a skinware.transfer.collecting.FrameListener -------------------------------------------------------------

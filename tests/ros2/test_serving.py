@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 from skinware import DriverReader, DriverWriter, Namespace, Status
 from skinware.conversion.ros_messages import Cdr
 from skinware.errors import Paused
+from skinware.ros2.serving import DriverTopics
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, publishing
 from tests.recording.test_viewers import placed
@@ -111,6 +113,25 @@ def test_a_restart_with_other_sensors_is_followed(namespace: Namespace) -> None:
             wait_until(lambda: "/skin/arm/points/temperature" not in graph.publishers)
             assert POINTS in graph.publishers
         wait_until(lambda: server.drivers()["arm"].state == "gone")
+
+
+def test_states_are_taken_between_two_turns(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another thread may ask while the server attaches to drivers, reads them, and forgets them."""
+    publish, amid, answered = DriverTopics.publish, threading.Event(), threading.Event()
+    answered_amid = []
+
+    def slow_publish(*arguments: Any, **options: Any) -> None:
+        amid.set()
+        answered_amid.append(answered.wait(0.05))
+        publish(*arguments, **options)
+
+    monkeypatch.setattr(DriverTopics, "publish", slow_publish)
+    with FakeSkin("arm", small()) as skin, served(namespace) as (_, server), ThreadPoolExecutor() as pool:
+        skin.publish()
+        amid.wait()
+        asking = pool.submit(lambda: (server.drivers(), answered.set()))
+        assert set(asking.result()[0]) == {"arm"}
+    assert not answered_amid[0]
 
 
 def test_values_are_never_told_under_the_sensors_of_another_generation(namespace: Namespace) -> None:

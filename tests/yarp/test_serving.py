@@ -18,6 +18,7 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import now_ns
 from skinware.tactile.regions import Region
 from skinware.yarp.names import NameServer
+from skinware.yarp.port import Receiver
 from skinware.yarp.serving import Settings, YarpServer
 from skinware_drivers.description import assemble
 from skinware_drivers.streams.yarp import YarpDriver, YarpOptions
@@ -141,6 +142,26 @@ def test_two_drivers_of_ports_of_one_name_are_never_mixed(namespace: object, yar
         with contextlib.closing(Skin("other", port="hand", length=30)):
             wait_until(lambda: any("driver hand has the port" in event.get("why", "") for event in told))
             assert {name: port["driver"] for name, port in there.ports().items()} == {"/skinware/hand": "hand"}
+
+
+def test_ports_may_be_asked_while_others_come(namespace: object, yarp: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    with contextlib.closing(Skin("hand")), served(yarp) as (there, _):
+        wait_until(lambda: bool(there.ports()))
+        ports = there._ports
+        (port,) = ports.values()
+
+        class Growing:
+            @property
+            def receivers(self) -> list[Receiver]:
+                """Of a port that is asked at the moment at which the thread of the server adds another."""
+                ports["/skinware/foot"] = port
+                return []
+
+        monkeypatch.setattr(port, "port", Growing())
+        assert set(there.ports()) == {"/skinware/hand"}
+        assert set(there.ports()) == {"/skinware/hand", "/skinware/foot"}
+        monkeypatch.undo()
+        del ports["/skinware/foot"]
 
 
 def test_what_is_no_skin_is_left_out_with_a_word(namespace: object, yarp: Robot) -> None:

@@ -245,11 +245,13 @@ class RobotiqTsfDriver(SerialAdapter[RobotiqTsfOptions]):
         answer = await link.request(_VERSION, b"", Match(_ANSWER | _VERSION), timeout_s=_TIMEOUT_S, tries=_TRIES)
         return answer.payload.hex(".")
 
-    def _finger(self, finger: int, heard: Mapping[int, Sequence[object]]) -> Patch:
+    def _finger(self, finger: int, heard: Mapping[int, Sequence[tuple[int, int]]]) -> Patch:
         modules = []
         for key, kind in _KINDS.items():
-            times = sum(len(heard.get(key << 4 | finger | bit, ())) for bit in (0, _UNTIMED))
-            period_s = self.options.learn_s / max(times - 1, 0.5)  # not heard, or once: twice the time of listening
+            times_ns = sorted(time_ns for bit in (0, _UNTIMED) for time_ns, _ in heard.get(key << 4 | finger | bit, ()))
+            period_s = 2 * self.options.learn_s  # not heard, or once
+            if len(times_ns) > 1:
+                period_s = (times_ns[-1] - times_ns[0]) / NS_PER_S / (len(times_ns) - 1)
             channels = taxels(kind.taxels, *(each.name for each in kind.types), first_uid=finger << 8 | key << 5)
             shape = "7x4" if kind.taxels > 1 else kind.name
             slow = period_s if period_s > 1.5 * self.period_s else None

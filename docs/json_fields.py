@@ -53,6 +53,8 @@ def _rows(cls: type, prefix: str) -> Iterator[tuple[str, str, str, str]]:
 
 def _json_type(key: str, hint: Any) -> tuple[str, str, type | None]:
     """Return the key, its type (none: it only leads to others) and the class of its own keys."""
+    if hasattr(get_origin(hint), "__value__"):  # an alias with parameters, as NDArray is from numpy 2.5 on
+        return _json_type(key, get_origin(hint).__value__[get_args(hint)])
     if get_origin(hint) is Annotated:
         return _json_type(key, get_args(hint)[0])
     if get_origin(hint) in (Union, types.UnionType):

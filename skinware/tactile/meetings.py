@@ -46,7 +46,7 @@ def fit_bells(
     log_peak = np.log(np.maximum(peak, _SMALL))
     unknown = expected = np.column_stack([place, log_peak])
     prior = np.column_stack([np.tile(1 / variance_m2[:, None], 3), np.full(k, _LOG_PEAK**-2)]).ravel()
-    precision = (_MISFIT * max(value.max(), _LEAST_VALUE * peak.max(), _SMALL)) ** -2
+    precision: float = (_MISFIT * max(value.max(), _LEAST_VALUE * peak.max(), _SMALL)) ** -2
     most = np.column_stack([np.tile(width[:, None], 3), np.ones(k)])
     for _ in range(_STEPS):
         away = position[None] - unknown[:, None, :3]

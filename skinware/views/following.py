@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 import numpy.typing as npt
@@ -111,7 +111,7 @@ class Origin:
 class PlotFunction:
     """A function of snapshots of a driver (None: the first) that is plotted; ``problem``: why it failed last."""
 
-    function: Callable[[DriverSnapshot], float]
+    function: Callable[[DriverSnapshot], SupportsFloat]
     driver: str | None = None
     unit: str = ""
     problem: str = ""

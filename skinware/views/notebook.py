@@ -8,6 +8,7 @@ from collections.abc import Callable
 from html import escape
 from importlib.util import find_spec
 from pathlib import Path
+from typing import SupportsFloat
 from urllib.parse import urlencode
 
 from skinware.driver_snapshot import DriverSnapshot
@@ -58,7 +59,12 @@ class View:
         self.url: str = f"http://127.0.0.1:{self._port}/" + (f"?{query}" if query else "")
 
     def plot(
-        self, name: str, function: Callable[[DriverSnapshot], float], *, driver: str | None = None, unit: str = ""
+        self,
+        name: str,
+        function: Callable[[DriverSnapshot], SupportsFloat],
+        *,
+        driver: str | None = None,
+        unit: str = "",
     ) -> None:
         """Plot a function of each snapshot of a driver in all pages; again to replace it.
 

@@ -133,8 +133,8 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
             figures, mean = NO_VALUE, ""
             if len(values):
                 figures, mean = (
-                    f"{figure_text(values.min(), 5)} to {figure_text(values.max(), 5)}",
-                    f" (mean {figure_text(values.mean(), 5)})",
+                    f"{figure_text(float(values.min()), 5)} to {figure_text(float(values.max()), 5)}",
+                    f" (mean {figure_text(float(values.mean()), 5)})",
                 )
             parts.append(f"{sensor_type.name} {figures} {'raw' if counts else sensor_type.unit}{mean}")
     return "  ".join([*parts, f"{not_fresh} not fresh"])

@@ -210,7 +210,7 @@ def test_contacts_come_with_the_touch_and_are_an_image(namespace: Namespace) -> 
         live.open()
         image, touch = live.at(begin_ns)
         assert touch.contacts is not None
-        assert (len(touch.contacts.contacts), image.max()) == (0, 0)
+        assert (len(touch.contacts.contacts), int(image.max())) == (0, 0)
         touched[[6, 7]] = True
         contacts.publish(np.full(15, 2.0), touched, begin_ns + MS)
         image, touch = live.at(begin_ns + MS)
@@ -247,7 +247,7 @@ def test_a_live_image_shows_the_touch_of_its_moment() -> None:
         assert image.dtype == np.uint8
         lit = np.argwhere(image[..., 0] == 255)
         assert np.ptp(lit, axis=0).tolist() == [7, 4]  # the second row of two, the first column of three
-        assert (image.sum(), touch.values[3]) == (len(lit) * 3 * 255, 10.0)
+        assert (int(image.sum()), float(touch.values[3])) == (len(lit) * 3 * 255, 10.0)
         live.close()
 
 

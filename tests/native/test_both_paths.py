@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, event, given, settings
 from hypothesis import strategies as st
@@ -126,7 +127,7 @@ def test_patches_that_send_together_are_shown_together(clock: HandClock) -> None
                 pair.feed([(0, clock.now_ns, 0x100 | key, bytes([period]))])
                 clock.now_ns += pause_ms * 1_000_000
         assert pair.frames == 8
-        assert pair.numpy.frame(8)["values"].tolist() == [6, 6, 7]  # all of the last 3 ms
+        assert np.asarray(pair.numpy.frame(8)["values"]).tolist() == [6, 6, 7]  # all of the last 3 ms
 
 
 def test_signaling_nans_stay_what_they_are(clock: HandClock) -> None:

@@ -175,7 +175,7 @@ def test_boards_that_send_together_are_shown_together(monkeypatch: pytest.Monkey
             desk.feed(desk.burst(period, board=board))
             desk.clock.now_ns += pause_ms * MS
     frames = [desk.reader._ring.copy(sequence) for sequence in range(1, desk.writer.sequence + 1)]
-    shown = [(np.ptp(frame.module_time_ns) > 40 * MS, set(frame.values.tolist())) for frame in frames if frame]
+    shown = [(bool(np.ptp(frame.module_time_ns) > 40 * MS), set(frame.values.tolist())) for frame in frames if frame]
     assert shown[:2] == [(True, {2}), (True, {3})]
     assert shown[2:] == [(False, {value - 1, value}) for value in range(4, 10)]  # without a period left out
     desk.close()

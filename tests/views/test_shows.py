@@ -124,7 +124,7 @@ def test_at_a_paused_moment_nothing_grows_old(recording: Path) -> None:
         time.sleep(0.5)  # longer than a value is fresh
         wait_until(lambda: bool(follower.take(0)))
         (driver,) = follower.drivers
-        assert (driver.life, driver.status.max()) == ("live", 0)
+        assert (driver.life, int(driver.status.max())) == ("live", 0)
 
 
 def test_each_viewer_plays_for_itself_and_leaves_nothing(serving: Serve, recording: Path) -> None:

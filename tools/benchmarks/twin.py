@@ -21,12 +21,13 @@ from skinware.tactile.calibration.force import ForceData, fit_force
 from skinware.tactile.contacts import ContactSet
 from skinware.tactile.curves import CurveTable
 from skinware.tactile.neighbours import neighbours
-from skinware.tactile.onsets import EventKind, Events, Onsets
+from skinware.tactile.onsets import EventKind, Events
 from skinware.tactile.testing import Surface
 from skinware_drivers.virtual.physics import WORLD_NS
 from skinware_drivers.virtual.physics.binding import Bound, find_binding
 from skinware_drivers.virtual.physics.body import Touching
 from skinware_drivers.virtual.physics.world import PhysicsWorld
+from tests.specification.chain import Onsets
 
 ArrayF = npt.NDArray[np.float64]
 PERIOD_NS = 10_000_000

@@ -9,6 +9,7 @@ grows by what the gain may be wrong, and by the drift that was measured at rest.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -49,7 +50,7 @@ class Grouping:
         self.group = group
         self.n = int(group.max(initial=-1)) + 1
 
-    def sum(self, values: npt.NDArray[np.generic]) -> Doubles:
+    def sum(self, values: npt.NDArray[np.bool_ | np.integer[Any] | np.floating[Any]]) -> Doubles:
         """Return (n_groups,) the sums of (n,) values, one after the other."""
         return np.bincount(self.group, values, self.n).astype(np.float64)
 

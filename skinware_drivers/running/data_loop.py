@@ -89,17 +89,18 @@ class Intake:
         loop = asyncio.get_running_loop()
         begun_ns = now_ns()
         taken = self.take()
-        if taken == "nothing":
-            self.start()
-        else:
-            loop.remove_reader(self._epoll.fileno())
-            links = [line.link for line in self._lines]
-            asks = any(line.bus.asks for line in self._lines)
-            factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
-            if asks or any(link.expects_data for link in links):
-                factor = _REST_IN_STEP  # only the answer comes, and then the next question
-            rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
-            self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
+        if taken == "nothing" or self.latency_s <= 0:
+            if self._rest is not None:
+                self.start()
+            return
+        loop.remove_reader(self._epoll.fileno())
+        links = [line.link for line in self._lines]
+        asks = any(line.bus.asks for line in self._lines)
+        factor = _REST_WHILE_ASKING if any(link.is_awaiting for link in links) else _REST
+        if asks or any(link.expects_data for link in links):
+            factor = _REST_IN_STEP  # only the answer comes, and then the next question
+        rest_s = min(factor * (now_ns() - begun_ns) / NS_PER_S, self.latency_s)
+        self._rest = loop.call_later(rest_s if taken == "all" else 0, self._look)
 
     def _fill(self, batch: FrameBatch, fds: Sequence[int], time_ns: int) -> bool:
         """Fill a batch from the buses that have frames; return whether none had more than its share."""

@@ -288,6 +288,8 @@ class NativePath:
     def announce_waits(self, expects_data: bool, awaited: Sequence[Filter]) -> None:
         """Set what coroutines wait for, before a call of C: frames that may be data, or awaited ones of no module."""
         self._words.expects_data = expects_data
+        if not awaited and not self._plan.n_awaited:
+            return
         conditions = [structs.IdentifierCondition(mask, value) for value, mask in awaited]
         self._awaited = (structs.IdentifierCondition * len(conditions))(*conditions)
         self._plan.n_awaited, self._plan.awaited = len(conditions), ctypes.addressof(self._awaited)
@@ -309,7 +311,8 @@ class NativePath:
 
     def interrupt(self, buses: Sequence[int]) -> None:
         """Never join frames that wait for partners on these buses with later ones: frames were lost between them."""
-        self._exchange.interrupted[list(buses)] = True
+        for bus in buses:
+            self._exchange.interrupted[bus] = True
 
     def publish_if_due(self, read_ns: int) -> None:
         """Publish a snapshot if it is due; all frames that arrived until ``read_ns`` were taken."""
@@ -340,9 +343,10 @@ class NativePath:
 
     def _leave(self) -> None:
         self._batch.start, self._batch.stop = self._rows.start, self._rows.stop
-        for bus in np.flatnonzero(self._exchange.skipped).tolist():
-            self._publisher.buses.counters[bus].updates_skipped += int(self._exchange.skipped[bus])
-        self._exchange.skipped[:] = 0
+        if self._exchange.skipped.any():
+            for counters, skipped in zip(self._publisher.buses.counters, self._exchange.skipped.tolist(), strict=True):
+                counters.updates_skipped += skipped
+            self._exchange.skipped[:] = 0
         if self._words.warns:
             self._words.warns = 0
             self._decoder.warn()

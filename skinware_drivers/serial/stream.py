@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import ctypes
 from abc import ABC, abstractmethod
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
@@ -127,7 +127,7 @@ class PythonStream(Stream):
         self._framer = framing.framer()
         self._framer.counters = counters.framing
         self._reads: list[tuple[int, int]] = []
-        self._backlog: list[tuple[list[Framed], npt.NDArray[np.int64]]] = []
+        self._backlog: list[tuple[list[Framed], list[int]]] = []
         self._damaged = b""
 
     @property
@@ -154,10 +154,10 @@ class PythonStream(Stream):
         fitting = [frame for frame in framed if len(frame.body) <= self._payload_size]
         self.counters.refused += len(framed) - len(fitting)
         if fitting:
-            time_of = np.full(len(fitting), time_ns)
+            time_of = [time_ns] * len(fitting)
             if fitting[0].end <= known:  # frames were held back behind a false beginning
                 ends, times = zip(*self._reads, strict=True)
-                time_of = np.array(times)[np.searchsorted(ends, [frame.end for frame in fitting])]
+                time_of = [times[bisect_left(ends, frame.end)] for frame in fitting]
             self._backlog.append((fitting, time_of))
         # keep the times of the bytes that are still held back
         undecided = framer.position - framer.pending

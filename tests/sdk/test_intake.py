@@ -82,6 +82,45 @@ def test_while_an_answer_is_waited_for_it_is_shorter(monkeypatch: pytest.MonkeyP
     assert rest_s == pytest.approx(TAKE_NS / 1e9)
 
 
+def test_without_a_rest_it_goes_on_looking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where it rested before."""
+
+    async def take() -> None:
+        loop = asyncio.get_running_loop()
+        gather = Intake(epoll, [line], lambda: FrameBatch(64, 8), lambda _batch: None, 1e-9)
+        gather.start()
+
+        def call_later(delay_s: float, call: Any) -> asyncio.TimerHandle:
+            rests.append(delay_s)
+            return loop.call_at(loop.time() + delay_s, call)
+
+        monkeypatch.setattr(loop, "call_later", call_later)
+        for latency_s in (1e-9, 1e-9, 0.0, 0.0, 0.0):
+            gather.latency_s = latency_s
+            os.eventfd_write(fd, 1)
+            await taken.acquire()
+        gather.stop()
+
+    def receive(_batch: FrameBatch, _ordinal: int) -> int:
+        os.eventfd_read(fd)
+        taken.release()
+        return 0
+
+    fd, taken = os.eventfd(0), asyncio.Semaphore(0)
+    rests: list[float] = []
+    line: Any = SimpleNamespace(
+        bus=SimpleNamespace(receive=receive, fileno=lambda: fd, asks=False),
+        link=SimpleNamespace(is_awaiting=False, expects_data=False),
+        condition=SimpleNamespace(heard_ns=0),
+        ordinal=0,
+    )
+    with select.epoll() as epoll:
+        epoll.register(fd, select.EPOLLIN)
+        asyncio.run(take())
+    os.close(fd)
+    assert rests == [1e-9, 1e-9]
+
+
 def test_none_of_its_looks_outlives_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where a new generation starts it again while it rests."""
     looks: list[asyncio.TimerHandle] = []
@@ -181,7 +220,7 @@ def test_it_says_until_when_all_was_taken(first_ns: int, first_told_ns: int) -> 
     os.close(fd)
 
 
-@pytest.mark.parametrize("latency_s", [0.0, 1e-4, 1e-3])
+@pytest.mark.parametrize("latency_s", [1e-4, 1e-3])
 def test_it_is_never_longer_than_what_was_asked_for(monkeypatch: pytest.MonkeyPatch, latency_s: float) -> None:
     assert rest_after_a_take(monkeypatch, latency_s=latency_s) == latency_s
 

@@ -32,6 +32,8 @@ from skinware.tactile.source_service import (
 from skinware.tactile.tracking import TrackingSettings
 
 NAME = "contacts"
+_NOTHING = {name: np.nan if dtype == "<f4" else 0 for name, (dtype, *_) in COLUMNS.items()} | {"frame": -1}
+"""The values of a row that is empty."""
 
 
 def _columns_of(source: Source) -> Columns:
@@ -163,14 +165,13 @@ class ContactsWriter(SourceWriter):
         Arguments as of :meth:`.Contacts.update`; raises ConfigurationError as that, and as ``begin``.
         """
         found = self._contacts.update(value, touched, acquired_ns, **more)
-        columns = self.begin()
-        for name in COLUMNS:
-            column = columns[name]
-            column[: len(found)] = getattr(found, name)
-            column[len(found) :] = np.nan if column.dtype.kind == "f" else 0
-        columns["frame"][len(found) :] = -1
+        columns, count = self.begin(), len(found)
+        for name, nothing in _NOTHING.items():
+            columns[name][count:] = nothing
+            if count:
+                columns[name][:count] = getattr(found, name)
         columns["contact_of"][:] = found.contact_of
-        columns["count"][:], columns["beyond"][:] = len(found), found.beyond
+        columns["count"][:], columns["beyond"][:] = count, found.beyond
         self.commit(acquired_ns)
         return found
 

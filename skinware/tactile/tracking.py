@@ -10,7 +10,18 @@ import numpy as np
 from skinware.realtime import NS_PER_S
 from skinware.tactile.arrays import Arrays, Doubles, Flags, Whole
 from skinware.tactile.meetings import Meetings, fit_bells, resume
-from skinware.tactile.tracks import TRACK, TouchedBlobs, Tracks, assign, correct, expected_at, is_shared, without_nan
+from skinware.tactile.tracks import (
+    TRACK,
+    TouchedBlobs,
+    Tracks,
+    assign,
+    correct,
+    expected_at,
+    is_shared,
+    judge,
+    move,
+    without_nan,
+)
 
 _STRONG, _WEAK, _LEFT, _NEAR = 5.0, 1.5, 0.3, 0.1
 """Gains of a pair that shares half of the smaller one's taxels, any, is what was left behind, or is near: one of the
@@ -25,7 +36,6 @@ _NEARNESS, _PRESENCE = 0.4, 0.2
 """Gains of a contact just where it was expected, and of one that was there in the last frame. They count where no
 taxels are shared, or the contact is so fast that shared taxels mean nothing."""
 _DOUBT = 0.5  # share of its expected way by which a contact may miss the expected place
-_CALM = 3.0  # time constant of the motion that is judged as sliding, in multiples of ``velocity_s``
 _NOISE_PITCHES = 0.3  # pitches: standard deviation of the centre of a contact of one taxel
 _NEW_M_S, _MOST_NEW, _MOST_FAST = 1.0, 8, 32
 """m/s: spread of the velocity of a new contact. Where more begin in a frame, or more are followed, none is fast."""
@@ -36,7 +46,6 @@ _PITCH_M = 0.0065  # m: pitch of taxels whose places are not known
 _REACH_PITCHES, _GATE = 2.3, 2.5
 """Pitches, or standard deviations of the expected place, by which a contact may miss it without sharing a taxel. 2.3 is
 a bit more than the second ring of neighbours."""
-_NARROWEST_PITCHES = 0.35  # pitches: width of a contact that only one taxel feels
 _LAST_ID = (1 << 32) - 1
 
 
@@ -99,6 +108,8 @@ class Tracker:
         self._settings = settings = settings or TrackingSettings()
         self._position_m = position_m
         self._pitch_m = settings.pitch_m or (pitch_m if pitch_m > 0 else _PITCH_M)
+        names = ("velocity_s", "touch_s", "sliding_m_s", "steady")
+        self._judged_by = np.array([*(getattr(settings, name) for name in names), self._pitch_m])
         self._tracks: Tracks = np.zeros(0, TRACK)
         self.track_of: Whole = np.full(len(position_m), -1, np.int64)
         self._taxels = np.zeros(0, np.int64)  # that have a track
@@ -137,8 +148,8 @@ class Tracker:
         tracks = self._with_new(expected, blobs, time_ns)
         tracks["shared"] = is_shared(tracks["home"])
         self._find(tracks, blobs, size, time_ns)
-        self._move(tracks, before)
-        self._judge(tracks, before, time_ns)
+        move(tracks, before, self._settings.velocity_s)
+        judge(tracks, before, time_ns, self._judged_by)
         self._meetings.end(tracks, time_ns)
         resume(tracks, self._settings.frames, self._pitch_m)
         self._keep(tracks, blobs, time_ns)
@@ -270,51 +281,6 @@ class Tracker:
         is_faint = peak < _FAINT * tracks["peak"][rows]
         is_faint[peak.argmax()] = False
         tracks["home"][rows[is_faint]] = -1
-
-    def _move(self, tracks: Tracks, before: Tracks) -> None:
-        """Update the velocities that are published; they stay where contacts merge or split, as their centres jump."""
-        known = np.arange(len(before))
-        passed_s = (tracks["seen_ns"][known] - before["seen_ns"]) / NS_PER_S
-        moved = (tracks["home"][known] >= 0) & (passed_s > 0) & (tracks["frame"][known] == before["frame"])
-        moved &= (tracks["shared"][known] == before["shared"]) & ~tracks["jumps"][known]
-        known, passed_s = known[moved], passed_s[moved]
-        velocity = (tracks["found"][known] - before["found"][known]) / passed_s[:, None]
-        tracks["steps"][known] += 1
-        weight = np.maximum(-np.expm1(-passed_s / self._settings.velocity_s), 1 / tracks["steps"][known])[:, None]
-        was = without_nan(tracks["velocity"][known])
-        tracks["velocity"][known] = was + weight * (velocity - was)
-
-    def _judge(self, tracks: Tracks, before: Tracks, time_ns: int) -> None:
-        """Update what is smoothed, and the kinds."""
-        settings, pitch_m = self._settings, self._pitch_m
-        here = np.flatnonzero(tracks["home"] >= 0)
-        now = tracks if len(here) == len(tracks) else tracks[here]
-        passed_s = np.zeros(len(here))
-        known = here < len(before)
-        passed_s[known] = np.maximum(time_ns - before["seen_ns"][here[known]], 0) / NS_PER_S
-        is_new = ~known
-        weight = np.where(is_new, 1.0, -np.expm1(-passed_s / settings.velocity_s))
-        found: Doubles = now["now"]
-        height: Doubles = now["height"]
-        load: Doubles = now["load"]
-        peak: Doubles = now["peak"]
-        width: Doubles = now["width"]
-        motion: Doubles = now["motion"]
-        frames: Whole = now["frames"]
-        alone = np.maximum(weight, 1 / frames) * ~now["shared"]
-        calm = -np.expm1(-passed_s / (_CALM * settings.velocity_s))[:, None]
-        load += weight * (found - load)
-        peak += alone * (height - peak)
-        measured = pitch_m * np.sqrt(found / (2 * np.pi * np.maximum(height, 1e-9)))
-        width += alone * (np.maximum(measured, _NARROWEST_PITCHES * pitch_m) - width)
-        motion += calm * (without_nan(now["velocity"]) - motion)
-        is_steady = abs(found - load) <= settings.steady * load
-        slowest = np.where(now["kind"] == ContactKind.SLIDING, settings.sliding_m_s / 2, settings.sliding_m_s)
-        is_sliding = is_steady & (np.linalg.norm(motion, axis=1) >= slowest)
-        is_old = time_ns - now["born_ns"] >= settings.touch_s * NS_PER_S
-        now["kind"] = np.where(is_old, np.where(is_sliding, ContactKind.SLIDING, ContactKind.HOLD), ContactKind.TOUCH)
-        if now is not tracks:
-            tracks[here] = now
 
     def _keep(self, tracks: Tracks, blobs: TouchedBlobs, time_ns: int) -> None:
         """Remember this frame, and the tracks whose contacts are gone."""

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.realtime import NS_PER_S
+from skinware import native
 from skinware.tactile.arrays import Doubles, Flags, Whole
 
 Tracks = npt.NDArray[np.void]
 
 LONGEST_GUESS_S = 0.1
 """Seconds for which a velocity is extrapolated."""
-_ACCELERATION_M_S2, _MANOEUVRE_S = 0.5, 0.1
-"""m/s2: spread of the acceleration of a slow contact. That of a fast one changes its velocity in this time, s."""
-_SURPRISE = 3.0  # standard deviations of a miss that is a change of the velocity
-_SHORTEST_S = 1e-3
+
+_calls = native.core().quick
+_expect, _correct = _calls.skinware_tracks_expect, _calls.skinware_tracks_correct
+_move, _judge = _calls.skinware_tracks_move, _calls.skinware_tracks_judge
+for _call in (_expect, _correct, _move, _judge):
+    _call.restype = None
+_expect.argtypes = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64
+_correct.argtypes = ctypes.c_void_p, ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64
+_move.argtypes = ctypes.c_void_p, ctypes.c_int64, ctypes.c_void_p, ctypes.c_double
+_judge.argtypes = (*(ctypes.c_void_p, ctypes.c_int64) * 2, ctypes.c_int64, ctypes.c_void_p)
 
 TRACK = np.dtype(
     [
@@ -43,12 +50,14 @@ TRACK = np.dtype(
         ("load", "f8"),  # smoothed
         ("peak", "f8"),  # smoothed
         ("width", "f8"),  # smoothed
+        ("noise", "f8"),  # variance of the place that was found
         ("sure", "?"),  # it was touched for sure
         ("shared", "?"),  # its blob has other tracks, too
         ("jumps", "?"),  # its centre may have moved because contacts merged or split
-        ("noise", "f8"),  # variance of the place that was found
-    ]
+    ],
+    align=True,
 )
+"""``struct track`` of tracks.c."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +95,7 @@ def is_shared(home: Whole) -> Flags:
 def expected_at(tracks: Tracks, time_ns: int) -> Tracks:
     """The tracks as they are expected at a time: places and spreads go on with the velocities."""
     expected = tracks.copy()
-    passed_s = np.clip((time_ns - tracks["seen_ns"]) / NS_PER_S, 0, LONGEST_GUESS_S)
-    pace = tracks["pace"]
-    expected["place"] += passed_s[:, None] * pace
-    change = (_ACCELERATION_M_S2 + np.sqrt((pace**2).sum(axis=1)) / _MANOEUVRE_S) * passed_s
-    _, both, variance = tracks["spread"].T
-    expected["spread"][:, 0] += passed_s * (2 * both + passed_s * (variance + change**2 / 4))
-    expected["spread"][:, 1] += passed_s * (variance + change**2 / 2)
-    expected["spread"][:, 2] += change**2
+    _expect(expected.ctypes.data, len(expected), time_ns)
     return expected
 
 
@@ -103,23 +105,17 @@ def without_nan(numbers: Doubles) -> Doubles:
 
 def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
     """Take in where tracks were found, instead of where they were expected."""
-    now = tracks if len(rows) == len(tracks) else tracks[rows]
-    passed_s = np.maximum((time_ns - now["seen_ns"]) / NS_PER_S, _SHORTEST_S)
-    miss = now["found"] - now["place"]
-    variance, both, pace = now["spread"].T
-    is_new = np.isinf(variance)
-    variance = np.where(is_new, 1.0, variance)  # m2: nothing is known
-    squares = (miss**2).sum(axis=1)
-    surprise = np.where((squares > _SURPRISE**2 * (variance + now["noise"])) & ~now["jumps"], squares, 0.0)
-    variance, both, pace = variance + surprise, both + surprise / passed_s, pace + surprise / passed_s**2
-    gain = variance / (variance + now["noise"])
-    pull = np.where(now["jumps"], 0.0, both / (variance + now["noise"]))
-    now["place"] += gain[:, None] * miss
-    now["pace"] += pull[:, None] * without_nan(miss)
-    pace += surprise / passed_s**2 - pull * both  # what changed once changes again
-    now["spread"] = np.column_stack([gain * now["noise"], both * (1 - gain), pace])
-    if now is not tracks:
-        tracks[rows] = now
+    _correct(tracks.ctypes.data, len(rows), rows.ctypes.data, time_ns)
+
+
+def move(tracks: Tracks, before: Tracks, velocity_s: float) -> None:
+    """Update the velocities that are published; they stay where contacts merge or split, as their centres jump."""
+    _move(tracks.ctypes.data, len(before), before.ctypes.data, velocity_s)
+
+
+def judge(tracks: Tracks, before: Tracks, time_ns: int, settings: Doubles) -> None:
+    """Update what is smoothed, and the kinds: by velocity_s, touch_s, sliding_m_s, steady, and the pitch, m."""
+    _judge(tracks.ctypes.data, len(tracks), before.ctypes.data, len(before), time_ns, settings.ctypes.data)
 
 
 def assign(gain: Doubles) -> tuple[Whole, Whole]:

@@ -30,7 +30,8 @@ WORDS = {
     BusReason.ERROR_WARNING: "error-warning: more errors than there should be (termination, wires?)",
     BusReason.OVERFLOW: "the controller lost frames: this machine did not fetch them in time",
     BusReason.NO_ACKNOWLEDGEMENT: "no node acknowledges what is sent (wires, power, another bit rate?)",
-    BusReason.BUS_ERRORS: "broken frames are heard (another bit rate, termination, wires?)",
+    BusReason.BUS_ERRORS: "broken frames are heard (another bit rate, termination, wires; over a network, another"
+    " program or version?)",
 }
 """The meaning of each reason, for people; other reasons come with an error."""
 

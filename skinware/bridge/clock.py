@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections import deque
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
 
 _KEPT_NS = 30 * NS_PER_S
+_RECENT = 5
 _AT_ONCE_NS = 20_000_000
 _HORIZON_NS = 3 * NS_PER_S // 2
 """An estimate must hold until the answers to the next questions come."""
@@ -77,6 +79,12 @@ class PeerClock:
     def round_trip_ns(self) -> int:
         """The shortest of the last half minute; 0: none is known."""
         return min((sample.round_trip_ns for sample in self._samples), default=0)
+
+    @property
+    def recent_round_trip_ns(self) -> int:
+        """The longest of the last few; 0: none is known. The delay of a link may have grown since the shortest."""
+        recent = itertools.islice(reversed(self._samples), _RECENT)
+        return max((sample.round_trip_ns for sample in recent), default=0)
 
     def pause_ns(self) -> int:
         return _FAST_NS if self._rounds < _FAST_ROUNDS else _SLOW_NS

@@ -209,7 +209,7 @@ class Peer:
                     target=self._diagnose, args=(time_ns,), name="skinware bridge diagnosis", daemon=True
                 ).start()
         elif silent_ns > _SILENCE_NS - _PING_NS:
-            round_trip_ns = self.clock.round_trip_ns if self.clock.is_known else _LONGEST_ROUND_TRIP_NS
+            round_trip_ns = self.clock.recent_round_trip_ns if self.clock.is_known else _LONGEST_ROUND_TRIP_NS
             if silent_ns > _SILENCE_NS + _ROUND_TRIPS * round_trip_ns:
                 self._lose("nothing comes over the link")
             elif time_ns - self._pinger.asked_ns > _PING_NS:

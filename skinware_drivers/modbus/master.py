@@ -172,7 +172,8 @@ class Master:
         if self._open is not None or time_ns < self._free_ns:
             return b""
         if self._late is not None:
-            self._overdue.lose(self._late.message, self._asked_ns(self._late))
+            late = self._late
+            self._overdue.lose(late.message, self._asked_ns(late), may_be_mute=late.read >= 0)
             self._late = None
             self._drop_from_line()
         if self._overdue.drains:
@@ -197,6 +198,8 @@ class Master:
         Raises:
             ValueError: they are no Modbus, and bytes that follow could not be understood either.
         """
+        if self._overdue.drains:
+            self._overdue.hear()
         if isinstance(self._line, wire.TcpMessages):
             for message in self._line.feed(chunk):
                 asked, late = self._open, self._late
@@ -230,15 +233,17 @@ class Master:
     def _take_if_sure(self, asked: Open, message: Message, time_ns: int) -> None:
         if self._overdue.confuses(asked.message):
             self._open = self._late = None
-            self._free_ns = self._overdue.drain(asked.message, self._asked_ns(asked), time_ns)
+            self._free_ns = self._overdue.drain(self._asked_ns(asked), time_ns)
             self._counters.refused += 1
             self._schedule.retries.pop(("unit", message.unit), None)
             if asked.read == _GUEST:
                 self._guests.answer(None, time_ns)
+            elif asked.read >= 0:
+                self._again = asked
         elif asked is self._late:
             self._take_late(asked, message, time_ns)
         else:
-            self._overdue.take()
+            self._overdue.take(asked.message)
             self._take(asked, message, time_ns)
 
     def _asked_ns(self, asked: Open) -> int:
@@ -269,7 +274,7 @@ class Master:
     def _take_late(self, asked: Open, message: Message, time_ns: int) -> None:
         """Use a reply that came after its timeout: the device lives."""
         self._late, self._free_ns = None, time_ns + self._timing.turnaround_ns
-        self._overdue.take_late(time_ns - asked.until_ns)
+        self._overdue.take_late(asked.message, time_ns - asked.until_ns)
         self._counters.polls_late += 1
         self._schedule.retries.pop(("unit", message.unit), None)
         if self._counters.polls_late == 1:

@@ -185,6 +185,7 @@ class Far:
     def __init__(self, talk: Conversation, delay: int) -> None:
         self.talk, self.delay = talk, delay
         self.waiting: list[tuple[int, Message]] = []
+        self.silent: set[int] = set()  # addresses that it does not answer for
         self.shown: list[tuple[int, int]] = []
 
     def run(self, duration: int) -> None:
@@ -196,7 +197,9 @@ class Far:
             moments = [end, *([] if due is None else [due]), *(moment for moment, _ in self.waiting[:1])]
             talk.now = max(talk.now + 1, min(moments))
             if said := talk.master.say(talk.now):
-                self.waiting.append((talk.now + self.delay, talk._message(said)))
+                question = talk._message(said)
+                if address_of(question) not in self.silent:
+                    self.waiting.append((talk.now + self.delay, question))
             while self.waiting and self.waiting[0][0] <= talk.now:
                 question = self.waiting.pop(0)[1]
                 rows = talk.registers(question, address_of(question))
@@ -231,6 +234,19 @@ def test_replies_that_a_line_held_back_are_shown_for_no_other_registers(over_tcp
         far.run(3500 * MS)
         assert all(100 * (identifier + 1) == first for identifier, first in far.shown)
         assert {identifier for identifier, _ in far.shown[-5:]} == set(range(5))
+
+
+@pytest.mark.parametrize("silent", [{100}, {300}, {500}, {100, 200}, {100, 300, 500}])
+def test_registers_that_fall_silent_hide_no_others(over_tcp: bool, silent: set[int]) -> None:
+    far = Far(Conversation(*ALIKE, over_tcp=over_tcp), MS)
+    far.run(100 * MS)
+    far.silent = silent
+    far.run(1000 * MS)
+    for _ in range(5):
+        far.shown.clear()
+        far.run(1000 * MS)
+        assert {first for _, first in far.shown} == {100, 200, 300, 400, 500} - silent
+        assert all(100 * (identifier + 1) == first for identifier, first in far.shown)
 
 
 def test_without_a_late_reply_it_goes_on_after_a_while() -> None:

@@ -288,7 +288,8 @@ class Health:
         weak, dead = shown < settings.weak * shown_around, shown < settings.dead
         known = at_end[np.isfinite(at_end)]
         rests_at_end = bool(len(known)) and float(np.median(known)) > _USUAL  # hardware that cuts off its own noise
-        is_end = self._is_at_end(use.value) & (not rests_at_end)
+        least, most = self._limits
+        is_end = ((use.value <= least) | (use.value >= most)) & (not rests_at_end)
         stuck = self._stuck(still_s, dead)
         shows_other, other, other_shown = self._related(shown)
         often = max(settings.dropouts, _OFTEN * float(np.percentile(self._dropouts.count, 75)))
@@ -379,11 +380,6 @@ class Health:
     def _typical_noise(self) -> float:
         known = self._noise.deviation[np.isfinite(self._noise.deviation)]
         return max(float(np.median(known)) if len(known) else 0.0, self._least_noise)
-
-    def _is_at_end(self, values: Floats) -> Flags:
-        least, most = self._limits
-        at_end: Flags = (values <= least) | (values >= most)
-        return at_end
 
     def _stuck(self, still_s: Doubles, dead: Flags) -> Flags:
         """Whether taxels have not changed for long, although their module was touched, and nothing holds them now."""

@@ -10,7 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skinware.memory.namespace import Namespace
+from skinware.sensor_types import PRESSURE
+from skinware_drivers.description import Module, Patch, assemble, taxels
+from skinware_drivers.fields import DeviceTime, Identifier
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.native.device_time import DeviceClock
+from tests.specification.both_paths import Pair, hand_clock
 from tests.specification.device_time import SpecifiedClock
 
 S, MS = 1_000_000_000, 1_000_000
@@ -115,3 +121,29 @@ def test_a_long_life_agrees() -> None:
     assert known(clock) == specified.known()
     assert clock.state.stops > 0
     assert clock.state.drift == pytest.approx(2e-4, abs=2e-5)
+
+
+def test_a_stop_is_named_once_and_a_patch_is_forgotten(namespace: Namespace, caplog: pytest.LogCaptureFixture) -> None:
+    """Two patches on two buses; the clock of the second one stops."""
+    frame = Frame("one", [Identifier(1)], [8], Values(0, "<u2", 2), time=DeviceTime(4, "<u2", 1e-3))
+    tip = Patch("tip", [Module(taxels(2))])
+    tables = assemble([("b0", [tip]), ("b1", [tip])], [PRESSURE], np.uint16)
+
+    def send(time_ns: int, stamp: int) -> None:
+        pair.clock.now_ns = max(pair.clock.now_ns, time_ns)
+        stamps = (time_ns // MS & 0xFFFF, stamp & 0xFFFF)
+        pair.feed([(bus, time_ns, 1, bytes(4) + each.to_bytes(4, "little")) for bus, each in enumerate(stamps)])
+
+    with hand_clock() as clock, Pair(clock, [Layout([frame])] * 2, tables, [1.0] * 2, namespace=namespace) as pair:
+        begin_ns = clock.now_ns + S
+        for number in range(8):
+            send(begin_ns + number * S, 0)
+        state, late_ns = pair.native.decoder.state, begin_ns + 7 * S + 900 * MS
+        send(begin_ns + 7 * S + 100 * MS, 100)
+        send(late_ns, 200)
+        assert late_ns - state.patch_time_ns[1] > 500 * MS
+        pair.do(lambda way: way.decoder.forget(1))
+        send(late_ns + MS, 201)
+        assert state.patch_time_ns[1] == late_ns + MS
+    warnings = [record.message for record in caplog.records if "stands still" in record.message]
+    assert [warning.split(" stands still")[0] for warning in warnings] == ["b1: the clock of tip"] * 2

@@ -105,6 +105,7 @@ class PapillArrayDriver(SerialAdapter[PapillArrayOptions]):
             while True:
                 heard = sizes_of((await news.get()).payload)
                 if not heard.items() <= self._heard.items():
+                    self._heard |= heard
                     self.tell(self._described[0], Notice.CHANGED)
 
     @operation(sets_up=True)

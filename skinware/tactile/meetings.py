@@ -60,7 +60,7 @@ def fit_bells(
         unknown = unknown + np.clip(step, -most, most)
     covariance = np.linalg.inv(information).reshape(k, 4, k, 4)
     of_place = covariance[np.arange(k), :3, np.arange(k), :3]
-    along_skin: Doubles = np.linalg.eigvalsh(of_place)[:, :2].mean(axis=1)  # across it, nothing is seen
+    along_skin = np.asarray(np.linalg.eigvalsh(of_place)[:, :2].mean(axis=1), np.float64)  # across it, nothing is seen
     return unknown[:, :3], along_skin, np.exp(unknown[:, 3])
 
 

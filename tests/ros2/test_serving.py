@@ -125,12 +125,16 @@ def test_states_are_taken_between_two_turns(namespace: Namespace, monkeypatch: p
         answered_amid.append(answered.wait(0.05))
         publish(*arguments, **options)
 
+    def ask() -> set[str]:
+        found = set(server.drivers())
+        answered.set()
+        return found
+
     monkeypatch.setattr(DriverTopics, "publish", slow_publish)
     with FakeSkin("arm", small()) as skin, served(namespace) as (_, server), ThreadPoolExecutor() as pool:
         skin.publish()
         amid.wait()
-        asking = pool.submit(lambda: (server.drivers(), answered.set()))
-        assert set(asking.result()[0]) == {"arm"}
+        assert pool.submit(ask).result() == {"arm"}
     assert not answered_amid[0]
 
 

@@ -217,9 +217,13 @@ def test_nothing_is_closed_while_a_thread_of_zenoh_wakes_it(at: Router, monkeypa
         time.sleep(0.05)  # it must not be closed in this time, nor later
         os.fstat(fd)
 
+    def close_link() -> None:
+        end_link()
+        link_closed.set()
+
     with joined(at, 0, _topics("/touch")) as port, ThreadPoolExecutor() as pool:
         end_link = port._link.close
-        monkeypatch.setattr(port._link, "close", lambda: (end_link(), link_closed.set()))
+        monkeypatch.setattr(port._link, "close", close_link)
         monkeypatch.setattr(os, "eventfd_write", slow_write)
         woken = pool.submit(port._wake)
         waking.wait()

@@ -65,7 +65,7 @@ def test_both_paths(library: Path) -> None:
     arguments = ["-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", "--hypothesis-seed=1", tests]
     done = run(library, *arguments, SKINWARE_EXAMPLES="25")
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
-    assert re.search(r"^6 passed", done.stdout, re.MULTILINE)
+    assert re.search(r"^\d+ passed in", done.stdout, re.MULTILINE)  # and none skipped
 
 
 @pytest.mark.thorough

@@ -16,6 +16,7 @@ import msgspec.inspect
 from skinware.errors import ConfigurationError
 
 T = TypeVar("T", bound=msgspec.Struct)
+_MOST_BYTES = 16_000_000
 Keys = tuple[str | int, ...]
 """Where a value is: ``("bus", 1, "name")``."""
 
@@ -35,7 +36,7 @@ class TomlText:
         self._text = ""
         try:
             if path is not None:
-                self._text = path.read_text(encoding="utf-8")
+                self._text = _text_of(path)
             self.data: dict[str, Any] = tomllib.loads(self._text)
         except OSError as error:
             raise ConfigurationError(f"{path}: {error.strerror}") from None
@@ -78,6 +79,15 @@ class TomlText:
         )
         found: tuple[Any, ...] = getattr(self.of_format(what, format_name, version, struct), key)
         return found
+
+
+def _text_of(path: Path) -> str:
+    """Return the text of a file, or of a pipe; refuse what does not end."""
+    with path.open("rb") as file:
+        found = file.read(_MOST_BYTES + 1)
+    if len(found) > _MOST_BYTES:
+        raise ConfigurationError(f"{path}: it has more than {_MOST_BYTES} bytes: is this the right file?")
+    return found.decode("utf-8")
 
 
 def wrong_value(error: msgspec.ValidationError, struct: type[msgspec.Struct]) -> tuple[str, Keys]:

@@ -240,7 +240,7 @@ class Chain:
         structure: structure of the output: the same sensors, float32, with the units of the last stages.
         stages: by type.
         baseline_stages, curve_stages: by type, the first stage that is a baseline, and the last that is a curve.
-        values, status: (n_sensors,) float32 and uint8, the output of the newest frame; the next one overwrites it.
+        output, flags: (n_sensors,) float32 and uint8, values and status of the newest frame; the next overwrites them.
         at: address of its ``struct chain``, for C.
         vectors: the types that are axes of vectors, for each stage that shows vectors.
     """
@@ -268,11 +268,11 @@ class Chain:
         self._signals = {name: Signal(structure.index(name)) for name, stages in self.stages.items() if stages}
         self._steps = [(stage, [self._signals[name] for name in names]) for stage, names in steps]
         self._warm = [stage for stage in self.curve_stages.values() if stage.table.warms]
-        self.values: Floats = np.zeros(structure.n_sensors, np.float32)
-        self.status: Bytes = np.zeros(structure.n_sensors, np.uint8)
+        self.output: Floats = np.zeros(structure.n_sensors, np.float32)
+        self.flags: Bytes = np.zeros(structure.n_sensors, np.uint8)
         signals = np.array([signal.at for signal in self._signals.values()], np.uint64)
         self._kept = words, _ = STRUCTS["Chain"](), signals
-        given: Arrays = {"values": self.values, "status": self.status, "signals": signals}
+        given: Arrays = {"values": self.output, "status": self.flags, "signals": signals}
         words.n, words.n_signals = structure.n_sensors, len(signals)
         give_arrays(words, 0, {}, given)
         self.at: int = ctypes.addressof(words)
@@ -344,7 +344,7 @@ class Chain:
             temperature_c = temperature_of(frame)
             for curve in self._warm:
                 curve.temperature_c = temperature_c
-        self.values[:], self.status[:] = frame.physical_values(), frame.status
+        self.output[:], self.flags[:] = frame.physical_values(), frame.status
         _begin(self.at)
         time_ns = frame.acquired_ns
         for signal in self._signals.values():
@@ -352,11 +352,11 @@ class Chain:
         for stage, signals in self._steps:
             stage.step(*signals)
         _end(self.at)
-        values[:], status[:] = self.values, self.status
+        values[:], status[:] = self.output, self.flags
 
     def lose(self) -> None:
         """Let the output be that of a dead driver: nothing is known, and nothing touches."""
-        self.values[:], self.status[:] = 0, UNUSABLE
+        self.output[:], self.flags[:] = 0, UNUSABLE
 
     def explain(self, uncertainty: Floats, why: Bytes) -> None:
         """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""

@@ -62,6 +62,7 @@ class Guests:
         self._guests: list[Guest] = []  # the one that was served longest ago comes first
         self._open: tuple[Guest, Message] | None = None
         self._has_written = False
+        self._had_turn = False  # the newest question on the line was one of theirs
         self._silent: defaultdict[int, Backoff] = defaultdict(pauses_of_device)
 
     @property
@@ -82,8 +83,14 @@ class Guests:
         if self._open is None or self._open[0] is not guest:
             self._refuse_first(guest)
 
-    def next(self, time_ns: int) -> Message | None:
-        """Take the question that is to be asked now, if any; call ``answer`` when it is over."""
+    def next(self, time_ns: int, *, is_read_due: bool) -> Message | None:
+        """Take the question that is to be asked now, if any; call ``answer`` when it is over.
+
+        Between two reads that are due, one question is asked.
+        """
+        if is_read_due and self._had_turn:
+            self._had_turn = False
+            return None
         while waiting := [guest for guest in self._guests if guest.waiting]:
             waiting.sort(key=lambda guest: wire.is_write(guest.waiting[0].data) is self._has_written)
             guest = waiting[0]
@@ -97,7 +104,9 @@ class Guests:
                 continue
             self._has_written = wire.is_write(question.data)
             self._open = guest, question
+            self._had_turn = True
             return question
+        self._had_turn = False
         return None
 
     def give_up(self) -> None:

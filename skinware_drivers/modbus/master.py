@@ -138,7 +138,6 @@ class Master:
         self._line = wire.TcpMessages(counters.framing) if over_tcp else wire.RtuMessages(counters.framing)
         self._number = 0  # of the last question; over TCP only
         self._commands: deque[Message] = deque()
-        self._was_guest = False
         self._open: Open | None = None
         self._late: Open | None = None
         self._overdue = Overdue(timing.timeout_ns)
@@ -183,12 +182,9 @@ class Master:
             return self._ask(again.message, again.read, time_ns, again.tries)
         if self._commands:
             return self._ask(self._commands.popleft(), _COMMAND, time_ns)
-        if not (self._schedule.is_due(time_ns) and self._was_guest):
-            question = self._guests.next(time_ns)
-            if question is not None:
-                self._was_guest = True
-                return self._ask(question, _GUEST, time_ns)
-        self._was_guest = False
+        question = self._guests.next(time_ns, is_read_due=self._schedule.is_due(time_ns))
+        if question is not None:
+            return self._ask(question, _GUEST, time_ns)
         read = self._schedule.take(time_ns, self._counters)
         return b"" if read is None else self._ask(self._schedule.questions[read], read, time_ns)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from skinware.errors import ConfigurationError
-from skinware.toml_text import Keys, line_of
+from skinware.toml_text import Keys, TomlText, line_of
 from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.cli.driver_file import ConfigFile
 
@@ -111,3 +111,8 @@ def test_a_mistake_that_is_not_of_the_file(tmp_path: Path) -> None:
     file.write_text("[options]\nno_load = 240")
     with pytest.raises(ConfigurationError, match=r"^board address 77: "):
         ConfigFile(file).options_of_bus(RoboskinOptions, "can0", {"boards": "77"})
+
+
+def test_a_file_without_an_end_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="/dev/zero: it has more than 16000000 bytes"):
+        TomlText(Path("/dev/zero"))

@@ -100,7 +100,7 @@ def test_a_chain_takes_the_axes_of_a_driver_together(tmp_path: Path) -> None:
     assert np.flatnonzero(loads.touched).tolist() == [0]
     assert loads.more["uncertainty"] is not None
     assert not np.any(loads.more["clipped"])
-    chain.status[1] = Status.STALE
+    chain.flags[1] = Status.STALE
     loads.find()
     assert not loads.touched.any()
 

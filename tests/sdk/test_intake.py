@@ -6,6 +6,7 @@ import asyncio
 import os
 import select
 import sys
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,6 +20,18 @@ from skinware_drivers.running.data_loop import Intake
 from tests.sdk.driving import driving, emulated
 
 TAKE_NS = 100_000
+
+
+def line_of(
+    fd: int, receive: Callable[[FrameBatch, int], int], *, is_awaiting: bool = False, expects_data: bool = False
+) -> Any:
+    """Return as much of a line as an intake needs."""
+    return SimpleNamespace(
+        bus=SimpleNamespace(receive=receive, fileno=lambda: fd, asks=False),
+        link=SimpleNamespace(is_awaiting=is_awaiting, expects_data=expects_data),
+        condition=SimpleNamespace(heard_ns=0),
+        ordinal=0,
+    )
 
 
 def rest_after_a_take(
@@ -55,12 +68,7 @@ def rest_after_a_take(
         await first_rest
         gather.stop()
 
-    line: Any = SimpleNamespace(
-        bus=SimpleNamespace(receive=receive, fileno=lambda: read, asks=False),
-        link=SimpleNamespace(is_awaiting=is_awaiting, expects_data=in_step),
-        condition=SimpleNamespace(heard_ns=0),
-        ordinal=0,
-    )
+    line = line_of(read, receive, is_awaiting=is_awaiting, expects_data=in_step)
     try:
         epoll.register(read, select.EPOLLIN)
         asyncio.run(take())
@@ -108,12 +116,7 @@ def test_without_a_rest_it_goes_on_looking(monkeypatch: pytest.MonkeyPatch) -> N
 
     fd, taken = os.eventfd(0), asyncio.Semaphore(0)
     rests: list[float] = []
-    line: Any = SimpleNamespace(
-        bus=SimpleNamespace(receive=receive, fileno=lambda: fd, asks=False),
-        link=SimpleNamespace(is_awaiting=False, expects_data=False),
-        condition=SimpleNamespace(heard_ns=0),
-        ordinal=0,
-    )
+    line = line_of(fd, receive)
     with select.epoll() as epoll:
         epoll.register(fd, select.EPOLLIN)
         asyncio.run(take())
@@ -148,12 +151,7 @@ def test_none_of_its_looks_outlives_it(monkeypatch: pytest.MonkeyPatch) -> None:
         return 0
 
     fd = os.eventfd(0)
-    line: Any = SimpleNamespace(
-        bus=SimpleNamespace(receive=receive, fileno=lambda: fd, asks=False),
-        link=SimpleNamespace(is_awaiting=False, expects_data=False),
-        condition=SimpleNamespace(heard_ns=0),
-        ordinal=0,
-    )
+    line = line_of(fd, receive)
     with select.epoll() as epoll:
         epoll.register(fd, select.EPOLLIN)
         asyncio.run(take())

@@ -16,7 +16,7 @@ TAKEN = ("value", "peak", "usual", "changed_s", "seen", "touched", "total", "abo
 
 
 def calm_of(random: np.random.Generator, given: npt.NDArray[np.float32]) -> Calm:
-    """What a baseline at 20 might make of it; NaN before it is known."""
+    """Return a frame as a baseline at 20 might calm it; NaN before it is known."""
     calm = Calm.of(np.zeros(SHOWN * N, np.uint8))
     calm.baseline[:] = np.where(random.random(N) < 0.05, np.nan, 20 + random.random(N))
     calm.noise[:] = np.where(np.isnan(calm.baseline), np.nan, 0.5 + random.random(N))

@@ -153,7 +153,7 @@ def test_ports_may_be_asked_while_others_come(namespace: object, yarp: Robot, mo
         class Growing:
             @property
             def receivers(self) -> list[Receiver]:
-                """Of a port that is asked at the moment at which the thread of the server adds another."""
+                """Add another port at this moment, as the thread of the server may."""
                 ports["/skinware/foot"] = port
                 return []
 

@@ -44,11 +44,7 @@ Block = dict[str, npt.NDArray[Any]]
 
 
 def package(name: str, what: str, *, extra: str = "convert") -> Any:
-    """Return a package of an extra, imported when it is needed.
-
-    Raises:
-        MissingExtra: it is not installed; ``what`` needs it.
-    """
+    """Return a package of an extra, imported when it is needed."""
     try:
         return import_module(name)
     except ImportError:
@@ -90,11 +86,7 @@ class Table(ABC):
 
     @abstractmethod
     def blocks(self, names: Collection[str]) -> Iterator[Block]:
-        """Yield rows of some arrays, a few at a time; each call begins again with the first.
-
-        Raises:
-            BadRecording, OSError: they cannot be read.
-        """
+        """Yield rows of some arrays, a few at a time; each call begins again with the first."""
 
     @property
     def origin(self) -> Generation:
@@ -186,11 +178,7 @@ def cannot_hold(format_name: str, table: Table, what: str) -> ConfigurationError
 
 
 def check_distinct(names: Sequence[str], format_name: str, table: Table) -> None:
-    """Refuse arrays of a table that would have one name in a file.
-
-    Raises:
-        ConfigurationError: two are the same.
-    """
+    """Refuse arrays of a table that would have one name in a file."""
     for name, count in Counter(names).items():
         if count > 1:
             raise cannot_hold(format_name, table, f"two columns that are both {name!r} there")
@@ -313,11 +301,6 @@ class RecordedSource:
 
     Attributes:
         frames: samples in the last pass over each table, by its name.
-
-    Raises:
-        BadRecording: it is not a recording, needs a newer version, or has no sample that can be used.
-        ConfigurationError: it has no service, type or patch of a name, or none of the chosen sensors.
-        OSError: it cannot be read.
     """
 
     def __init__(

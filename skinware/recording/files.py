@@ -163,9 +163,6 @@ class Files(Target):
         split_size: bytes after which another file begins; None: one file.
         max_size: most bytes of all files together: the oldest of several are removed, a single one is ended. None: no
             limit.
-
-    Raises:
-        OSError: the first file cannot be made.
     """
 
     def __init__(self, path: Path, *, split_size: int | None = None, max_size: int | None = None) -> None:

@@ -91,10 +91,6 @@ class McapSource:
         chunks: places of its chunks, in the order of the file; without a summary only those that are whole.
         damaged: number of damaged chunks found so far.
         refused: a line for each chunk that claims more bytes than the limits allow.
-
-    Raises:
-        BadRecording: it is not an MCAP file, or is compressed in another way.
-        OSError: it cannot be read.
     """
 
     def __init__(self, path: Path, limits: Limits = LIMITS) -> None:

@@ -167,10 +167,6 @@ class Recorder:
         Args:
             duration_s: how long; None: without end.
             report: called once a second.
-
-        Raises:
-            OSError: the recording cannot be written any more, or its file was deleted, replaced, moved or changed. The
-                chunks written before are complete.
         """
         end_ns = None if duration_s is None else now_ns() + round(duration_s * NS_PER_S)
         report_ns = now_ns() + _REPORT_NS

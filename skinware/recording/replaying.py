@@ -141,10 +141,6 @@ class Replayer:
 
     Attributes:
         late: samples that were published more than 10 ms after their time.
-
-    Raises:
-        BadRecording: its services need more shared memory than the limits allow.
-        ConfigurationError: the recording has no samples of one of them.
     """
 
     def __init__(

@@ -88,9 +88,6 @@ class ViewServer:
         Args:
             port: to listen at; 0: any.
             ready: called with the port when browsers can connect.
-
-        Raises:
-            OSError: the address or port cannot be used.
         """
         server = await serve(
             self._attend,

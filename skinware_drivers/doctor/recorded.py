@@ -38,12 +38,7 @@ _PartT = TypeVar("_PartT", BusSeen, PatchSeen)
 
 
 def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
-    """Examine a whole recording.
-
-    Raises:
-        BadRecording: the file is not a recording, or one of a newer version.
-        OSError: the file cannot be read.
-    """
+    """Examine a whole recording."""
     with skinware.recording.open(file) as recording:
         events = recording.events
         drivers = {name: _DriverTrack(name) for name in recording.drivers}

@@ -117,9 +117,6 @@ def known_drivers(medium: str, only: Collection[str] = ()) -> dict[str, type[Any
     Args:
         medium: kind of bus, ``can``.
         only: drivers, as ``load_driver`` takes them; none: all that are registered and can be loaded.
-
-    Raises:
-        ConfigurationError: one of ``only`` does not exist, or cannot be loaded.
     """
     found = {short_name(name): load_driver(name) for name in only}
     for name in () if only else sorted(registered(DRIVERS)):

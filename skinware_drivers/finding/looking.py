@@ -74,9 +74,6 @@ async def listen(
 
     Args:
         bus: of this name, not opened yet; default: it is made.
-
-    Raises:
-        ConfigurationError: this is not the name of a bus.
     """
     bus = bus or make_bus(bus_name, payload_size=_CAN_PAYLOAD, listen_only=True)
     traffic, bits_before = Traffic(), bus.wire_bits

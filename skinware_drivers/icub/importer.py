@@ -146,9 +146,6 @@ def import_files(
         positions: position file of a body part, if the names of the files are ambiguous.
         bus_names: bus of each patch; only for one device.
         wants_buses: their buses will be connected to this computer.
-
-    Raises:
-        ConfigurationError: a file cannot be read, or there is no skin device, or none with a given name.
     """
     files = _Sources(dict(positions or {}), notes)
     for path in paths:
@@ -309,11 +306,7 @@ class _Sources:
         return candidates[0] if candidates else None
 
     def name_unused(self, ports: set[str]) -> None:
-        """Note the files of body parts that are not imported.
-
-        Raises:
-            ConfigurationError: a person chose a file for an unknown body part.
-        """
+        """Note the files of body parts that are not imported."""
         for name in self._chosen:
             if name not in ports:
                 raise ConfigurationError(f"--positions {name}=...: no part that is imported has a port of this name")

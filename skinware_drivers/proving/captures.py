@@ -71,11 +71,7 @@ def check_capture(
 
 
 def decoded_then(capture: Path) -> Decoding:
-    """Return the values that the driver published during the capture.
-
-    Raises:
-        BadRecording, ConfigurationError, OSError: as for :func:`check_capture`.
-    """
+    """Return the values that the driver published during the capture."""
     with skinware.recording.open(capture) as recording:
         wires = _wires(recording)
         found = Collected(_began_ns(recording, wires))
@@ -120,11 +116,7 @@ def decoded_now(
 
 
 def driver_type_of(capture: Path) -> str:
-    """Return the recorded driver, for ``--driver``.
-
-    Raises:
-        BadRecording, ConfigurationError, OSError: as for :func:`check_capture`; or the file does not name it.
-    """
+    """Return the recorded driver, for ``--driver``."""
     with skinware.recording.open(capture) as recording:
         return _driver_type(recording, recording.about(_wires(recording)[0].driver))
 
@@ -148,11 +140,7 @@ def _began_ns(recording: Recording, wires: Sequence[WireSource]) -> int:
 
 
 class _ReplayedWire:
-    """A recorded wire, and the adapter of the present driver on it.
-
-    Raises:
-        ConfigurationError: the driver has no such options, or is for another kind of bus.
-    """
+    """A recorded wire, and the adapter of the present driver on it."""
 
     def __init__(
         self,

@@ -55,9 +55,6 @@ class EmulatedBus(Bus):
         listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.
         clock: stamps what comes, and makes the timer behind ``fileno``.
-
-    Raises:
-        ConfigurationError: no such emulator, or an option is unknown or has a bad value.
     """
 
     opens_slowly: ClassVar[bool] = False
@@ -368,9 +365,5 @@ def _class_of(channel: str, _options: object) -> type[Bus]:
 def virtual_bus(
     channel: str, options: dict[str, str] | None = None, *, payload_size: int = 8, listen_only: bool = False
 ) -> Bus:
-    """Return the bus ``virtual``: CAN, a serial line or a Modbus line, as the devices need it.
-
-    Raises:
-        ConfigurationError: there is no such emulator, or an option is unknown or has a bad value.
-    """
+    """Return the bus ``virtual``: CAN, a serial line or a Modbus line, as the devices need it."""
     return _class_of(channel, options)(channel, options, payload_size=payload_size, listen_only=listen_only)

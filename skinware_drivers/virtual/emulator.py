@@ -207,11 +207,7 @@ class Emulator(Stage[OptionsT]):
 
 
 def each_value(name: str, given: int | Sequence[int], n_values: int) -> npt.NDArray[np.int64]:
-    """Return (n_values,) int64 from one number, or from one for each value.
-
-    Raises:
-        ConfigurationError: the number of values is another.
-    """
+    """Return (n_values,) int64 from one number, or from one for each value."""
     numbers = np.asarray(given, np.int64)
     if numbers.shape not in ((), (n_values,)):
         raise ConfigurationError(f"{name} has {numbers.size} numbers, `places` has {n_values} values")

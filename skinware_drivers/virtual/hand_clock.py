@@ -28,12 +28,7 @@ class _Itimerspec(ctypes.Structure):
 
 
 class MonotonicTimer:
-    """An open timer that does not run.
-
-    Raises:
-        PlatformError: this system has no timerfd.
-        OSError: no descriptor was left.
-    """
+    """An open timer that does not run."""
 
     def __init__(self) -> None:
         # PyDLL: the calls never block, so they need not let go of the interpreter lock and wait for it again
@@ -56,9 +51,6 @@ class MonotonicTimer:
 
         Args:
             time_ns: CLOCK_MONOTONIC ns; None for never.
-
-        Raises:
-            OSError: the timer is closed.
         """
         value = self._spec.it_value
         value.seconds, value.nanoseconds = (0, 0) if time_ns is None else divmod(max(time_ns, 1), 1_000_000_000)

@@ -91,11 +91,7 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class JsonLinesLog:
-    """Write events to a file, one JSON object a line, each as soon as it happens.
-
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
+    """Write events to a file, one JSON object a line, each as soon as it happens."""
 
     def __init__(self, path: str | Path) -> None:
         self._encoder = msgspec.json.Encoder()
@@ -275,9 +271,5 @@ def name_of(emulator: type) -> str:
 
 
 def load_emulator(name: str) -> HardwareFactory:
-    """Return the emulator of a name; see :func:`skinware_drivers.loading.load`.
-
-    Raises:
-        ConfigurationError: there is no such emulator, or it cannot be loaded.
-    """
+    """Return the emulator of a name; see :func:`skinware_drivers.loading.load`."""
     return cast("HardwareFactory", load(_EMULATOR, name))

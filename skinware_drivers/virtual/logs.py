@@ -48,10 +48,6 @@ class LogFile:
     Args:
         path: of the log; its first bytes show its format.
         bus: a bus that must be in it; empty: those among its first frames count.
-
-    Raises:
-        ConfigurationError: it is no log, or damaged before its first frame.
-        OSError: it cannot be read.
     """
 
     def __init__(self, path: str, bus: str = "") -> None:
@@ -76,11 +72,7 @@ class LogFile:
         return {"listen_only": not self._has_sent}
 
     def frames(self) -> Iterator[tuple[str, WireItem]]:
-        """Yield the name of the bus and each frame.
-
-        Raises:
-            ConfigurationError: the log is damaged; the message says where.
-        """
+        """Yield the name of the bus and each frame."""
         with open(self.path, "rb") as file:
             begin = file.read(4096)
             file.seek(0)

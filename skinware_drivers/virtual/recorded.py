@@ -269,12 +269,6 @@ def replayed_bus(
         listen_only: refuse to send, and wait for no question.
         clock: of the replay.
         note: is called for each frame; see :class:`.recorded_wire.RecordedWire`.
-
-    Raises:
-        ConfigurationError: an option is unknown or has a bad value, the file cannot be read, or the options fit no bus
-            or more than one.
-        BadRecording: the recording is damaged.
-        MissingExtra: recordings need packages that are not installed.
     """
     wanted = options_from_strings(ReplayOptions, options or {})
     recording = _open(channel, wanted.bus)
@@ -298,9 +292,6 @@ def recorded_driver(bus_name: str) -> Recorded:
 
     Args:
         bus_name: ``replay:FILE?key=value`` or ``file:FILE?key=value``.
-
-    Raises:
-        ConfigurationError, BadRecording, MissingExtra: as for :func:`replayed_bus`.
     """
     _, channel, options = parse_bus_name(bus_name)
     wanted = options_from_strings(ReplayOptions, options)
@@ -352,9 +343,6 @@ def wire_of(recording: Recording | LogFile, bus: str = "", driver: str = "") -> 
     Args:
         bus: its name; empty: any.
         driver: its driver; empty: any.
-
-    Raises:
-        ConfigurationError: none fits, or more than one.
     """
     wires = recording.wires
     if not wires:

@@ -42,9 +42,6 @@ class Stage(ABC, HasOptions[OptionsT]):
         longest_queue: frames that a device keeps for the wire; more are lost.
         silent: kinds of frames that the devices do not send; see :meth:`kind_of`.
         world: the physics that presses the devices; None: they feel the option ``pattern``.
-
-    Raises:
-        ConfigurationError: an option names a device or a world that does not exist.
     """
 
     medium: ClassVar[str] = "can"
@@ -205,21 +202,13 @@ class Stage(ABC, HasOptions[OptionsT]):
     # Faults at a moment of the caller's choice
 
     def kill(self, number: int, now_ns: int) -> None:
-        """Make a device fall silent and deaf for good; frames that wait for the wire are lost.
-
-        Raises:
-            ConfigurationError: there is no such device.
-        """
+        """Make a device fall silent and deaf for good; frames that wait for the wire are lost."""
         now_ns = self.run_to(now_ns)
         self.die(self.device(number), now_ns)
         self.find_next_event()
 
     def restart(self, number: int, now_ns: int) -> None:
-        """Cut a device's power for a moment (a dead one lives again): it forgets its settings and is deaf for a while.
-
-        Raises:
-            ConfigurationError: there is no such device.
-        """
+        """Cut a device's power for a moment (a dead one lives again): it forgets its settings, and is deaf a while."""
         now_ns = self.run_to(now_ns)
         self.lose_power_for_a_moment(self.device(number), now_ns)
         self.find_next_event()
@@ -287,11 +276,7 @@ class Stage(ABC, HasOptions[OptionsT]):
     # Within
 
     def power_up(self, now_ns: int) -> None:
-        """Make the devices and everything else on the bus.
-
-        Raises:
-            ConfigurationError: the option ``silence`` names a kind of frame that does not exist.
-        """
+        """Make the devices and everything else on the bus."""
         options = self.options
         for number in self.numbers:
             self.devices[number] = self.make_device(number, now_ns)

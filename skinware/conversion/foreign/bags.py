@@ -30,11 +30,6 @@ class BagSource(ColumnSource):
 
     Numbers in messages within messages are columns, as ``header.stamp``; lists of messages are arrays; a point cloud
     has a column for each of its fields, an image the column ``image``.
-
-    Raises:
-        ConfigurationError: it is no bag, or damaged.
-        MissingExtra: rosbags is not installed.
-        OSError: it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:

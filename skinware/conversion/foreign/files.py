@@ -34,12 +34,7 @@ class _Array(NamedTuple):
 
 
 class NpzSource(ColumnSource):
-    """An NPZ file. Arrays of equally many rows are a table: ``""``, or ``N rows`` where a file has several.
-
-    Raises:
-        ConfigurationError: it is no such file, or damaged.
-        OSError: it cannot be read.
-    """
+    """An NPZ file. Arrays of equally many rows are a table: ``""``, or ``N rows`` where a file has several."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -121,13 +116,7 @@ def _plain(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 class ParquetSource(ColumnSource):
-    """A Parquet file, or all files of a folder in the order of their names.
-
-    Raises:
-        ConfigurationError: it is no such file, or damaged.
-        MissingExtra: pyarrow is not installed.
-        OSError: it cannot be read.
-    """
+    """A Parquet file, or all files of a folder in the order of their names."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

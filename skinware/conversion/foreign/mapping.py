@@ -120,12 +120,7 @@ class MappedDriver(NamedTuple):
 
 
 def read_map(path: Path, source: ColumnSource) -> list[MappedDriver]:
-    """Read a map for a source.
-
-    Raises:
-        ConfigurationError: it is no map, or does not fit the source; the message says where.
-        OSError: the source cannot be read.
-    """
+    """Read a map for a source."""
     text = TomlText(path)
     drivers = text.of_format("map of columns", FORMAT, VERSION, _MapFile).driver
     return [_mapped(each, source, text, number) for number, each in enumerate(drivers)]

@@ -34,10 +34,6 @@ class TextSource(ColumnSource):
 
     Args:
         path: of the text, in UTF-8.
-
-    Raises:
-        ConfigurationError: it is no such text.
-        OSError: it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:

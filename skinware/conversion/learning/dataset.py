@@ -47,10 +47,6 @@ class DatasetWriter:
         folder: of the dataset; it must not exist.
         fps: rows a second.
         video: images are written as videos.
-
-    Raises:
-        MissingExtra: pyarrow is not installed.
-        OSError: it cannot be written.
     """
 
     def __init__(
@@ -76,11 +72,7 @@ class DatasetWriter:
         self._whole = _FeatureStatistics(self._features, lengths, _SET_SAMPLE_BYTES)
 
     def add_episode(self, task: str, length: int, batches: Iterable[Batch]) -> None:
-        """Write an episode.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write an episode."""
         place = self._data.next_place()
         task_index = self._tasks.setdefault(task, len(self._tasks))
         statistics = _FeatureStatistics(self._features, [length], _EPISODE_SAMPLE_BYTES)
@@ -115,11 +107,7 @@ class DatasetWriter:
         self._episodes.close()
 
     def finish(self) -> None:
-        """Write the description and statistics of the whole dataset.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+        """Write the description and statistics of the whole dataset."""
         self.close()
         meta = self._folder / "meta"
         _write_tasks(self._arrow, self._tasks, meta / "tasks.parquet")

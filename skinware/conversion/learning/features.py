@@ -169,10 +169,6 @@ class Frames:
 
         Args:
             numbers: ascending; at most a window before the last one that was taken.
-
-        Raises:
-            BadRecording: they cannot be read, or differ from the pass before.
-            OSError: they cannot be read.
         """
         needed = int(numbers[-1]) - self._window + 1
         parts: list[Block] = []
@@ -209,10 +205,6 @@ class JoinedFeature:
 
     Args:
         joined: numbers, or paths of images.
-
-    Raises:
-        ConfigurationError: the first image is not a PNG file of the right kind.
-        OSError: it cannot be read.
     """
 
     def __init__(self, joined: Joined) -> None:
@@ -224,12 +216,7 @@ class JoinedFeature:
             self.description = Feature("float32", (joined.rows.shape[1],), joined.names)
 
     def rows(self, numbers: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
-        """Return (t, n) float32, or (t,) PNG files as bytes objects.
-
-        Raises:
-            ConfigurationError: an image differs in size from the first.
-            OSError: it cannot be read.
-        """
+        """Return (t, n) float32, or (t,) PNG files as bytes objects."""
         chosen = self._joined.rows[numbers]
         if self.description.dtype != IMAGE:
             return chosen
@@ -242,12 +229,7 @@ class JoinedFeature:
 
 
 def pixels_of(png: bytes) -> npt.NDArray[np.float32]:
-    """Return (pixels, 3, 1, 1) float32 of an image, 0 to 1; evenly spaced pixels of a large one.
-
-    Raises:
-        ConfigurationError: the image is damaged.
-        MissingExtra: pillow is not installed.
-    """
+    """Return (pixels, 3, 1, 1) float32 of an image, 0 to 1; evenly spaced pixels of a large one."""
     image_module = package("PIL.Image", "a data set with images")
     try:
         with image_module.open(BytesIO(png)) as image:

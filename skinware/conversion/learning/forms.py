@@ -31,9 +31,6 @@ class SetForm:
     Args:
         wanted: definition of the set.
         structures: of the drivers, by name in order.
-
-    Raises:
-        ConfigurationError: windows of several samples; images without a range of values, or too small.
     """
 
     def __init__(self, wanted: LearningSet, structures: Mapping[str, Structure]) -> None:

@@ -32,9 +32,6 @@ class TimedTable:
         period_ns: the driver's nominal period, 0 if it has none.
         recorded_ns: (f,) time of publication of each sample, wall clock, as recorded.
         times_ns: (f,) the same, never going back.
-
-    Raises:
-        BadRecording: the wall clock was set back between two frames.
     """
 
     def __init__(self, table: Table, structure: Structure) -> None:
@@ -109,10 +106,6 @@ class Planner:
 
     Attributes:
         notes: a line for each thing that was left out.
-
-    Raises:
-        ConfigurationError: the recording has no driver.
-        BadRecording: it cannot be read.
     """
 
     def __init__(
@@ -148,11 +141,7 @@ class Planner:
         return self._seconds(max(int(timed.times_ns[-1]) for tables in self._drivers.values() for timed in tables))
 
     def episodes(self, intervals: Sequence[Interval], task: str) -> list[Episode]:
-        """Return the episodes in some intervals, in order; without intervals those of the whole recording.
-
-        Raises:
-            ConfigurationError: intervals overlap, data is missing in one, or a structure changes in one.
-        """
+        """Return the episodes in some intervals, in order; without intervals those of the whole recording."""
         pieces = list(self._pieces())
         if not intervals:
             found = [self._episode(piece, piece.begin_ns, piece.end_ns, task) for piece in pieces]

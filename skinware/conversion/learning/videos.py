@@ -25,11 +25,6 @@ class Video:
         path: of the new file.
         fps: images a second.
         shape: height, width and channels of the images.
-
-    Raises:
-        ConfigurationError: a size that is odd, or too small.
-        MissingExtra: av or pillow is not installed.
-        OSError: it cannot be written.
     """
 
     def __init__(self, path: Path, fps: int, shape: tuple[int, ...]) -> None:

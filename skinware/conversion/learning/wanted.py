@@ -144,9 +144,6 @@ def intervals_of_marks(source: TableSource, end_s: float) -> list[Interval]:
     Args:
         source: the recording.
         end_s: time at which it ends, s since it began.
-
-    Raises:
-        ConfigurationError: there are no marks in it.
     """
     marks = [
         ((event["log_time_ns"] - source.start_ns) / NS_PER_S, str(event.get("text", "")))
@@ -222,11 +219,6 @@ class Joined:
 
     Attributes:
         rows: (m, n) float32; (m,) text for paths.
-
-    Raises:
-        ConfigurationError: the file has no times, lacks a column, or has something else than numbers or paths.
-        MissingExtra: the file is Parquet, and pyarrow is not installed.
-        OSError: it cannot be read.
     """
 
     def __init__(self, join: Join) -> None:
@@ -255,9 +247,6 @@ class Joined:
 
         Args:
             is_only: it is the only recording.
-
-        Raises:
-            ConfigurationError: the times refer to one recording, and there are several; or it lacks readings of clocks.
         """
         if self._time in _OF_ONE_RECORDING and not is_only:
             raise ConfigurationError(

@@ -27,9 +27,6 @@ class Actuators:
         names: of the actuators.
         poses: targets of actuators, by name of the pose.
         commanded_s: time of the scene at the newest command from outside; NaN: there was none.
-
-    Raises:
-        ConfigurationError: a pose does not fit the actuators.
     """
 
     def __init__(self, bound: Bound, model: Any, data: Any) -> None:
@@ -44,11 +41,7 @@ class Actuators:
             self._check(pose, f"{bound.file}: pose {name!r}")
 
     def move(self, targets: Mapping[str, float], seconds: float = 0.0) -> None:
-        """Move actuators to targets, evenly within a time.
-
-        Raises:
-            ConfigurationError: there is no such actuator, or a number is none.
-        """
+        """Move actuators to targets, evenly within a time."""
         self._check(targets, "move")
         if not 0 <= seconds <= 3600:
             raise ConfigurationError(f"move: {seconds} s: give 0 to 3600")

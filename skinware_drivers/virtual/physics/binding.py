@@ -109,11 +109,7 @@ class Bound(msgspec.Struct, frozen=True):
     scene: Path
 
     def settings(self, module: ModuleBinding) -> TransferSettings:
-        """Return the transfer of a module.
-
-        Raises:
-            ConfigurationError: a setting is unknown or out of its limits.
-        """
+        """Return the transfer of a module."""
         try:
             return msgspec.convert({**self.binding.transfer, **module.transfer}, TransferSettings)
         except msgspec.ValidationError as error:
@@ -128,9 +124,6 @@ def find_binding(world: str, driver: str) -> Bound:
     Args:
         world: ``mujoco:NAME`` of a scene of ours, ``mujoco:SCENE.xml`` or ``mujoco:BINDING.toml``. The binding of a
             scene is ``SCENE.DRIVER.toml`` beside it, or ``FOLDER.DRIVER.toml`` among ours.
-
-    Raises:
-        ConfigurationError: no such file, or one that cannot be used.
     """
     kind, _, name = world.partition(":")
     if kind != "mujoco" or not name:

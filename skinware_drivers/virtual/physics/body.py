@@ -54,9 +54,6 @@ class PhysicsScene:
         actuators: what moves in it.
         joints: names of its joints.
         touched_s: time of the scene when the present touch of modules began; NaN: nothing touches them.
-
-    Raises:
-        ConfigurationError: the scene cannot be used, or does not fit its binding.
     """
 
     def __init__(self, bound: Bound) -> None:

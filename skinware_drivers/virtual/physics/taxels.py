@@ -68,11 +68,7 @@ class BoundTaxels:
 
 
 def place(model: Any, module: ModuleBinding, bound: Bound) -> BoundTaxels:
-    """Place the taxels of a module on a body of a compiled scene.
-
-    Raises:
-        ConfigurationError: there is no such body, nothing of it is touched, or a taxel is not above it.
-    """
+    """Place the taxels of a module on a body of a compiled scene."""
     name = module.name or module.body
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, module.body)
     if body < 0:

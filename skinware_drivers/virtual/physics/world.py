@@ -34,9 +34,6 @@ class PhysicsWorld:
         scene: the physics.
         origin_ns: when the scene was at 0 s; later, once it has left time out.
         left_out_s: time of the scene that it left out because nothing called it.
-
-    Raises:
-        ConfigurationError: the scene or its binding cannot be used.
     """
 
     def __init__(self, bound: Bound, *, seed: int = 0, speed: float = 1.0, has_services: bool = False) -> None:
@@ -63,11 +60,7 @@ class PhysicsWorld:
         self._at_end: Callable[[], object] | None = None
 
     def fit(self, numbers: Sequence[int], n_values: int) -> None:
-        """Check that a binding fits the devices of an emulator.
-
-        Raises:
-            ConfigurationError: it has other devices, or more values than they send.
-        """
+        """Check that a binding fits the devices of an emulator."""
         for device, end in self._ends.items():
             if device not in numbers:
                 known = ",".join(map(str, numbers))

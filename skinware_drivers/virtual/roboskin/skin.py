@@ -96,11 +96,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     # Faults at a moment of the caller's choice
 
     def set_triangle(self, address: int, triangle: int, fault: TriangleState, now_ns: int) -> None:
-        """Break or mend a triangle; an unplugged one reads full pressure from its next burst on, and is flagged.
-
-        Raises:
-            ConfigurationError: there is no such board.
-        """
+        """Break or mend a triangle; an unplugged one reads full pressure from its next burst on, and is flagged."""
         now_ns = self.run_to(now_ns)
         _board(self.device(address)).set_triangle(triangle, fault, now_ns)
 

@@ -30,11 +30,7 @@ _LIMITS = (("board", 1, 14), ("triangle", 0, 15), ("taxel", 0, 11))
 
 
 class EmulatedRoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The boards, their touch and their faults.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or names a missing board.
-    """
+    """The boards, their touch and their faults."""
 
     boards: Annotated[tuple[int, ...], Meta(description="CAN addresses of the boards, 1-14")] = (7, 8, 9, 10)
     mtb3: Annotated[tuple[int, ...], Meta(description="boards of the older kind MTB3; the others are MTB4")] = ()
@@ -84,9 +80,6 @@ class EmulatedRoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_field
 
         Args:
             depth: 2 for (board, triangle), 3 for (board, triangle, taxel).
-
-        Raises:
-            ConfigurationError: a text has another form, or a number is out of its limits.
         """
         found: list[tuple[int, ...]] = []
         for text in getattr(self, name):
@@ -149,9 +142,6 @@ class PressedSkin:
 
     Args:
         physics: a world that presses it, too, instead of the wandering fingers.
-
-    Raises:
-        ConfigurationError: the file of the option ``stage`` cannot be used.
 
     Attributes:
         origin_ns: beginning of the stage file's time.

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
-CONTEXT_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"]}
-"""For ``click.group(context_settings=...)``, so that ``-h`` helps everywhere."""
+CONTEXT_SETTINGS: dict[str, Any] = {"help_option_names": ["-h", "--help"], "show_default": True}
+"""For ``click.group(context_settings=...)``: ``-h`` helps everywhere, and shows every default."""
 
 DEFAULT_REGIONS = "regions.toml"
 """File of regions where none is named, in the current folder."""
@@ -147,17 +147,8 @@ def output_option(
     what: str, *, name: str = "output", metavar: str = "FILE", required: bool = False, default: str | None = None
 ) -> Callable[[_Decorated], _Decorated]:
     """``-o FILE``: where the command writes."""
-    shown = default is not None
     return click.option(
-        "-o",
-        "--output",
-        name,
-        metavar=metavar,
-        type=FILE,
-        required=required,
-        default=default,
-        show_default=shown,
-        help=what,
+        "-o", "--output", name, metavar=metavar, type=FILE, required=required, default=default, help=what
     )
 
 

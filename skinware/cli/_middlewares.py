@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     "--rmw",
     type=click.Choice(["dds", "zenoh"]),
     default="dds",
-    show_default=True,
     help="Middleware of the graph: zenoh for nodes with RMW_IMPLEMENTATION=rmw_zenoh_cpp.",
 )
 @click.option(
@@ -57,23 +56,22 @@ if TYPE_CHECKING:
     metavar="N",
     envvar="ROS_DOMAIN_ID",
     default=0,
+    show_default=False,
     help="Id of the graph.  [default: $ROS_DOMAIN_ID, else 0]",
 )
-@click.option(
-    "--ros-namespace", metavar="NAME", default="/", show_default=True, help="Namespace of the topics: /robot_1."
-)
+@click.option("--ros-namespace", metavar="NAME", default="/", help="Namespace of the topics: /robot_1.")
 @click.option(
     "--distro",
     type=click.Choice(["humble", "jazzy"]),
     default=lambda: "humble" if os.environ.get("ROS_DISTRO") == "humble" else "jazzy",
+    show_default=False,
     help="Release of the other nodes; jazzy: Iron and later.  [default: $ROS_DISTRO, else jazzy]",
 )
-@click.option(
-    "--rate", type=float, default=20.0, show_default=True, metavar="HZ", help="Highest rate of point clouds and images."
-)
+@click.option("--rate", type=float, default=20.0, metavar="HZ", help="Highest rate of point clouds and images.")
 @click.option(
     "--root-frame",
     default="",
+    show_default=False,
     metavar="NAME",
     help="Publish /tf_static, if no other node does: all coordinate frames of the drivers at the origin of NAME,"
     " without rotation.",
@@ -165,8 +163,8 @@ def ros2(
     ),
 )
 @cli.names_argument
-@click.option("--prefix", default="/skinware", show_default=True, metavar="/P", help="Prefix of all port names.")
-@click.option("--type", "type_name", default="pressure", show_default=True, metavar="TYPE", help="Sensor type.")
+@click.option("--prefix", default="/skinware", metavar="/P", help="Prefix of all port names.")
+@click.option("--type", "type_name", default="pressure", metavar="TYPE", help="Sensor type.")
 @click.option(
     "--full-scale",
     type=click.FloatRange(min=0, min_open=True),
@@ -183,9 +181,7 @@ def ros2(
     type=click.Choice(["3", "4"]),
     help="Major version of the YARP of binary readers; without it, only text readers are served.",
 )
-@click.option(
-    "--listen", "host", default="127.0.0.1", show_default=True, metavar="HOST", help="Address at which ports listen."
-)
+@click.option("--listen", "host", default="127.0.0.1", metavar="HOST", help="Address at which ports listen.")
 @cli.namespace_option
 @cli.json_option
 def yarp(
@@ -259,7 +255,6 @@ _rate_option = click.option(
     "rate_hz",
     type=click.FloatRange(0.1, 1000),
     default=30.0,
-    show_default=True,
     metavar="HZ",
     help="Highest rate of snapshots.",
 )
@@ -273,7 +268,7 @@ _rate_option = click.option(
     ),
 )
 @cli.names_argument
-@click.option("--connect", metavar="URL", default=_RERUN, show_default=True, help="Viewer or server.")
+@click.option("--connect", metavar="URL", default=_RERUN, help="Viewer or server.")
 @cli.output_option("Write this file instead.", name="file")
 @_rate_option
 @cli.namespace_option
@@ -305,12 +300,8 @@ def rerun(
     epilog=cli.examples("skin-bridge foxglove   then, in Foxglove: open a connection to ws://127.0.0.1:8765"),
 )
 @cli.names_argument
-@click.option(
-    "--host", default="127.0.0.1", show_default=True, help="Address to listen at; anybody who reaches it sees the skin."
-)
-@click.option(
-    "--port", type=click.IntRange(0, 65535), default=_FOXGLOVE_PORT, show_default=True, help="0: any that is free."
-)
+@click.option("--host", default="127.0.0.1", help="Address to listen at; anybody who reaches it sees the skin.")
+@click.option("--port", type=click.IntRange(0, 65535), default=_FOXGLOVE_PORT, help="0: any that is free.")
 @_rate_option
 @cli.namespace_option
 @cli.json_option

@@ -133,7 +133,6 @@ def serve(
     "--mode",
     type=click.Choice(["auto", "push", "pull"]),
     default="auto",
-    show_default=True,
     help="Get every frame (push), or only the newest, as fast as the link takes them (pull).",
 )
 @cli.parts_options

@@ -23,7 +23,6 @@ _pitch = click.option(
     type=click.FloatRange(0, min_open=True),
     metavar="M",
     default=0.0065,
-    show_default=True,
     help="Distance between neighbouring sensors, metres.",
 )
 _gathering = cli.options(
@@ -33,7 +32,6 @@ _gathering = cli.options(
         "--share",
         type=click.FloatRange(0, 1),
         default=0.95,
-        show_default=True,
         help="Stop when this part of the sensors has enough.",
     ),
     cli.duration_option("Gather for SECONDS at most; 0: use the state file as it is."),
@@ -46,7 +44,7 @@ _gathering = cli.options(
 _pressing = cli.options(
     click.option("--poses", "service", metavar="SERVICE", required=True, help="Service that publishes poses."),
     click.option("--poses-namespace", metavar="NAME", help="Namespace of that service.  [default: as --namespace]"),
-    click.option("--touches", type=click.IntRange(1), default=5, show_default=True, help="Wanted on each sensor."),
+    click.option("--touches", type=click.IntRange(1), default=5, help="Wanted on each sensor."),
     click.option("--frame", metavar="NAME", help="Coordinate frame of the poses.  [default: name of the service]"),
 )
 
@@ -106,7 +104,7 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
 )
 @_output
 @_pressing
-@click.option("--column", metavar="NAME", default="point_m", show_default=True, help="With the points, metres.")
+@click.option("--column", metavar="NAME", default="point_m", help="With the points, metres.")
 @click.option("--layout", metavar="FILE", type=cli.FILE, help="Geometry whose modules have the right shapes.")
 @click.option(
     "--offset",
@@ -173,7 +171,7 @@ def touch(
 )
 @_output
 @_pressing
-@click.option("--column", metavar="NAME", default="pose", show_default=True, help="With the poses, 4 x 4, metres.")
+@click.option("--column", metavar="NAME", default="pose", help="With the poses, 4 x 4, metres.")
 @click.option(
     "--layout", metavar="FILE", type=cli.FILE, required=True, help="Geometry whose modules have the right shapes."
 )
@@ -275,10 +273,10 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
 )
 @_output
 @click.option("--reference", metavar="SERVICE", help="Service of a load cell or force-torque sensor.")
-@click.option("--column", metavar="NAME", default="force_n", show_default=True, help="With 1 or 3 forces, N.")
-@click.option("--axes", type=click.Choice(["1", "3"]), default="1", show_default=True, help="Forces in the column.")
+@click.option("--column", metavar="NAME", default="force_n", help="With 1 or 3 forces, N.")
+@click.option("--axes", type=click.Choice(["1", "3"]), default="1", help="Forces in the column.")
 @click.option("--newtons", type=click.FloatRange(0), multiple=True, metavar="N", help="A known weight, N; repeat it.")
-@click.option("--weight-s", type=click.FloatRange(0.5), default=8.0, show_default=True, help="How long each rests.")
+@click.option("--weight-s", type=click.FloatRange(0.5), default=8.0, help="How long each rests.")
 @_gathering
 def force(
     file: Path,

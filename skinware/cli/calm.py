@@ -46,17 +46,15 @@ if TYPE_CHECKING:
     "--contacts",
     metavar="NAME",
     default="contacts",
-    show_default=True,
     help="Name of the service of its contacts; NAME-contacts if that is taken; empty: none.",
 )
 @cli.regions_option("File with regions whose motion is published; may be repeated.")
 @cli.links_option("Links of the robot, as for skin-view: contacts hang together across the borders of links.")
-@click.option("--motion", metavar="NAME", default="motion", show_default=True, help="Name of the service of motion.")
+@click.option("--motion", metavar="NAME", default="motion", help="Name of the service of motion.")
 @click.option(
     "--health",
     metavar="NAME",
     default="health",
-    show_default=True,
     help="Name of the service of its sensors' health; empty: none, and no sensor is marked.",
 )
 @cli.group_option

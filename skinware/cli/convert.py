@@ -57,9 +57,7 @@ _learning_options = cli.options(
         type=cli.FILE,
         help="lerobot: a further recording; may be repeated.",
     ),
-    click.option(
-        "--fps", type=click.IntRange(1), default=30, show_default=True, metavar="N", help="lerobot: rows a second."
-    ),
+    click.option("--fps", type=click.IntRange(1), default=30, metavar="N", help="lerobot: rows a second."),
     click.option("--task", metavar="TEXT", help="lerobot: the task that is shown.  [default: FILE's name]"),
     click.option(
         "--episode",
@@ -81,24 +79,19 @@ _learning_options = cli.options(
         "form",
         type=click.Choice(["tactile", "state", "images", "points"]),
         default="tactile",
-        show_default=True,
         help="lerobot: touch as features of its own, or as stock policies read it.",
     ),
     click.option(
         "--numbers",
         type=click.Choice(["module", "taxel", "point"]),
         default="module",
-        show_default=True,
         help="lerobot, as state: sum and largest value of each module; each taxel; or place and force of each.",
     ),
-    click.option(
-        "--size", type=_size, default="64x64", show_default=True, metavar="WIDTHxHEIGHT", help="lerobot, as images."
-    ),
+    click.option("--size", type=_size, default="64x64", metavar="WIDTHxHEIGHT", help="lerobot, as images."),
     click.option(
         "--colours",
         type=click.Choice(["grey", "signed", "log"]),
         default="grey",
-        show_default=True,
         help="lerobot, as images.",
     ),
     click.option(
@@ -113,7 +106,6 @@ _learning_options = cli.options(
         "--resample",
         type=click.Choice(["previous", "nearest", "linear"]),
         default="previous",
-        show_default=True,
         help="lerobot: the newest sample at a row, the nearest, or values between the two around it.",
     ),
     click.option(
@@ -126,7 +118,6 @@ _learning_options = cli.options(
         "--window",
         type=_window,
         default="1",
-        show_default=True,
         metavar="N",
         help="lerobot: frames of a driver in each row; all: every frame between two rows.",
     ),
@@ -140,7 +131,6 @@ _learning_options = cli.options(
         "--match",
         type=click.Choice(["previous", "nearest"]),
         default="previous",
-        show_default=True,
         help="lerobot: which of those times belongs to a row.",
     ),
     click.option(
@@ -150,7 +140,11 @@ _learning_options = cli.options(
         help="lerobot: longest distance of that time from the row.  [default: the time between two rows]",
     ),
     click.option(
-        "--at", metavar="FEATURE", default="", help="lerobot: rows at the times of a joined feature, such as a camera."
+        "--at",
+        metavar="FEATURE",
+        default="",
+        show_default=False,
+        help="lerobot: rows at the times of a joined feature, such as a camera.",
     ),
     click.option(
         "--each-structure", is_flag=True, help="lerobot: a set for each structure of the drivers, in folders 1, 2 ..."

@@ -30,19 +30,16 @@ _ASK_S = 1.0
 @click.argument("x", type=float)
 @click.argument("y", type=float)
 @click.argument("z", type=float)
-@click.option("--force", "force_n", type=float, metavar="N", default=3.0, show_default=True, help="Newtons.")
+@click.option("--force", "force_n", type=float, metavar="N", default=3.0, help="Newtons.")
 @click.option(
     "--radius",
     "radius_m",
     type=float,
     metavar="M",
     default=0.006,
-    show_default=True,
     help="Radius of the touch, metres.",
 )
-@click.option(
-    "--seconds", type=float, metavar="S", default=1.0, show_default=True, help="Duration; the command does not wait."
-)
+@click.option("--seconds", type=float, metavar="S", default=1.0, help="Duration; the command does not wait.")
 @click.option("--name", metavar="NAME", help="Driver or emulator.  [default: the only one that can be pressed]")
 @cli.namespace_option
 @cli.json_option

@@ -44,7 +44,6 @@ _NEEDED = "textual>=8"
     "scale_name",
     type=click.Choice(["change", "range", "raw"]),
     default="change",
-    show_default=True,
     help="Colour scale at the start: change from the baseline, range of the type, or raw counts.",
 )
 @click.option("--region", metavar="NAME", help="Draw only sensors in this region at first.")

@@ -58,7 +58,7 @@ def token_text(text: str) -> str:
     type=click.IntRange(0, 65535),
     help=f"Port to listen at; 0: any that is free.  [default: {DEFAULT_PORT}, or any if that is in use]",
 )
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen at.")
+@click.option("--host", default="127.0.0.1", help="Address to listen at.")
 @click.option(
     "--token",
     metavar="TEXT",

@@ -6,6 +6,7 @@ import asyncio
 import inspect
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,7 +48,7 @@ class Declined(SkinwareError):
 )
 @click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
 @click.option("--config", metavar="FILE", type=cli.FILE, help="TOML file of that driver.")
-@click.option("-T", "timeout_s", type=cli.seconds, default="10", show_default=True, help="Wait SECONDS for a driver.")
+@click.option("-T", "timeout_s", type=cli.seconds, default="10", help="Wait SECONDS for a driver.")
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @click.option("--force", is_flag=True, help="Make changes even if something is sending on the bus.")
 @cli.namespace_option
@@ -225,5 +226,4 @@ def _lines(value: dict[str, Any], indent: str = "") -> list[str]:
     return lines
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,7 +90,7 @@ def _row(label: str, text: str, width: int = _LABEL) -> Iterator[str]:
     "skin-doctor --json | jq '.findings[] | {severity, what, where}'",
 )
 @click.argument("file", type=cli.FILE, required=False)
-@click.option("--seconds", "watch_s", type=cli.seconds, default="3", show_default=True, help="Look for SECONDS.")
+@click.option("--seconds", "watch_s", type=cli.seconds, default="3", help="Look for SECONDS.")
 @click.option(
     "--report",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -163,8 +164,7 @@ def _progress(passed_s: float) -> None:
         overwrite("" if passed_s < 0 else f"looking ... {passed_s:.1f} s", err=True)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)
 
 
 if __name__ == "__main__":

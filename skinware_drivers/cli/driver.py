@@ -233,8 +233,7 @@ def _has_terminal() -> bool:
     return True
 
 
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)
 
 
 def print_ready(runner: Runner, as_json: bool) -> None:

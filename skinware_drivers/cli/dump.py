@@ -6,6 +6,7 @@ import contextlib
 import select
 import time
 from collections.abc import Iterator
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Any
 
@@ -314,5 +315,4 @@ def _warn_of_missing(bus: Bus) -> None:
         cli.warn(text)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

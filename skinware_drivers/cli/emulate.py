@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +51,6 @@ def _options_of(given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
     "--driver",
     metavar="DRIVER",
     default=_DEFAULT_DRIVER,
-    show_default=True,
     help="Driver whose devices are emulated, or a file with an emulator.",
 )
 @click.option("--log", "log_path", metavar="FILE", help="Write every injected fault to FILE, as JSON lines.")
@@ -132,8 +132,7 @@ def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
     return hardware
 
 
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -33,7 +34,7 @@ _MOST_CLASSES = 6
     "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
 )
 @click.argument("buses", nargs=-1, metavar="[BUS]...")
-@click.option("--listen", "listen_s", type=cli.seconds, default="1", show_default=True, help="Listen for SECONDS.")
+@click.option("--listen", "listen_s", type=cli.seconds, default="1", help="Listen for SECONDS.")
 @click.option("--probe", is_flag=True, help="Send harmless requests to see which devices answer.")
 @click.option(
     "--driver",
@@ -372,5 +373,4 @@ def _wrapped(text: str, first: str = "  ") -> list[str]:
     return wrapped(first + text, _WIDTH)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -186,5 +187,4 @@ def _report(notes: Sequence[Note], verbose: bool) -> None:
             echo(f"  {note}", err=True)
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import sys
+from functools import partial
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -72,8 +73,7 @@ def command(name: str, transport: str) -> None:
     echo(f"then make it the driver of your hardware: {name}/src/{name}/driver.py says where to begin")
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)
 
 
 LONGEST_NAME = 20

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,10 +56,8 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     "--type", "type_name", metavar="TYPE", help="Sensors to look at.  [default: pressure, force, or the first]"
 )
 @click.option("--only", multiple=True, metavar="WORD", help="Modules with WORD in their name; repeat it for several.")
-@click.option("--wait", "patience_s", type=cli.seconds, default="30", show_default=True, help="SECONDS for each step.")
-@click.option(
-    "--rest", "rest_s", type=cli.seconds, default="3", show_default=True, help="Look at the skin at rest for SECONDS."
-)
+@click.option("--wait", "patience_s", type=cli.seconds, default="30", help="SECONDS for each step.")
+@click.option("--rest", "rest_s", type=cli.seconds, default="3", help="Look at the skin at rest for SECONDS.")
 @click.option("--tare", "with_tare", is_flag=True, help="At the end, let the driver tare, if it can.")
 @click.option(
     "-o",
@@ -360,5 +359,4 @@ def _print_compared(capture: Path, compared: Comparison, as_json: bool) -> None:
         echo(f"{style('different', fg='red')} {difference}")
 
 
-def main() -> None:
-    cli.run(command)
+main = partial(cli.run, command)

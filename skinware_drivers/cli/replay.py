@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +47,7 @@ def speed_text(text: str) -> float:
 )
 @click.argument("file", type=cli.FILE)
 @cli.names_argument
-@click.option("--speed", type=speed_text, default="1", show_default=True, metavar="X", help="2: twice as fast.")
+@click.option("--speed", type=speed_text, default="1", metavar="X", help="2: twice as fast.")
 @click.option("--start", "start_s", type=cli.seconds, default="0", metavar="SECONDS", help="Begin there.")
 @click.option("--end", "end_s", type=cli.seconds, metavar="SECONDS", help="End there.")
 @click.option("--loop", is_flag=True, help="Begin again at the end.")
@@ -56,7 +57,6 @@ def speed_text(text: str) -> float:
     "--times",
     type=click.Choice(["now", "recorded"]),
     default="now",
-    show_default=True,
     help="Times of frames: moved to now, which keeps their ages, or as recorded.",
 )
 @click.option(
@@ -232,5 +232,4 @@ class WireSender:
                 return
 
 
-def main() -> None:
-    cli.run(command, goes_on=True)
+main = partial(cli.run, command, goes_on=True)

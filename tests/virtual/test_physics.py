@@ -15,7 +15,7 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import GeometryGroup, geometry_to_toml, read_geometry
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.physics.binding import find_binding
-from skinware_drivers.virtual.physics.body import PhysicsScene, Touching, spread
+from skinware_drivers.virtual.physics.body import PhysicsScene, Touching, distances, spread
 from skinware_drivers.virtual.physics.taxels import places_in
 from skinware_drivers.virtual.physics.transfer import Transfer, TransferSettings
 from skinware_drivers.virtual.physics.world import PhysicsWorld
@@ -111,7 +111,9 @@ def test_the_centre_of_pressure_is_that_of_the_contact(tmp_path: Path, seed: int
 
 def test_a_contact_between_taxels_is_shared_by_the_nearest(tmp_path: Path) -> None:
     [module] = pad(tmp_path).modules
-    touch = Touching(0, np.zeros(3), np.array([0.0, 0.0, 1.0]), 2.0, np.array([0.5, 0.0, 0.0]), 0.0)
+    point_m, normal = np.zeros(3), np.array([0.0, 0.0, 1.0])
+    [distance_m] = distances(module, point_m[np.newaxis], normal[np.newaxis])
+    touch = Touching(0, point_m, normal, 2.0, np.array([0.5, 0.0, 0.0]), 0.0, distance_m)
     forces = spread(module, np.zeros(16), [touch])
     assert np.count_nonzero(forces[:, 2]) == 4
     assert forces.sum(axis=0) == pytest.approx([0.5, 0.0, 2.0])

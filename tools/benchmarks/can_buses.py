@@ -68,7 +68,7 @@ def run(
     receiver.wait(30)
     total, received = sum(json.loads(sent.stdout)), sum(result["frames"])
     cpu = result["cpu_s"] / max(result["wall_s"], 1e-9)
-    return Result(total, received, result["missed"], cpu, result["cpu_s"] / max(1, received) * 1e6)
+    return Result(total, received, result["lost"], cpu, result["cpu_s"] / max(1, received) * 1e6)
 
 
 def compare_receivers(arguments: argparse.Namespace) -> None:

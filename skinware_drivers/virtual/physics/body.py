@@ -34,6 +34,7 @@ class Touching(NamedTuple):
         normal_n: N.
         shear_n: (3,) in the same frame, on the module, N.
         slip_m_s: speed of the other body along the surface, m/s.
+        distance_m: (n,) of the module's taxels from it, m; infinite for those that face another way.
     """
 
     module: int
@@ -42,6 +43,7 @@ class Touching(NamedTuple):
     normal_n: float
     shear_n: ArrayF
     slip_m_s: float
+    distance_m: ArrayF
 
 
 class PhysicsScene:
@@ -67,15 +69,13 @@ class PhysicsScene:
             raise ConfigurationError(f"{bound.scene}: MuJoCo: {error}") from None
         self.data: Any = mujoco.MjData(self.model)
         self._sensors = place_sensors(self.model, self.modules)
-        self._module_of: dict[int, list[int]] = {}
+        self._feels = np.zeros((len(self.modules), self.model.ngeom), bool)
         for number, module in enumerate(self.modules):
-            for geom in module.geoms.tolist():
-                self._module_of.setdefault(geom, []).append(number)
+            self._feels[number, module.geoms] = True
+        self._is_covered = self._feels.any(axis=0)
         self.actuators = Actuators(bound, self.model, self.data)
         self.joints: list[str] = names_of(self.model, mujoco.mjtObj.mjOBJ_JOINT, self.model.njnt)
         self._touching: list[Touching] | None = None
-        self._is_covered = np.zeros(self.model.ngeom, bool)
-        self._is_covered[list(self._module_of)] = True
         self.touched_s = math.nan
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
@@ -110,16 +110,10 @@ class PhysicsScene:
 
     def touching(self) -> list[Touching]:
         """Return the contacts of all modules in the newest step."""
-        if self._touching is not None:
-            return self._touching
-        found = self._touching = []
-        for number in range(self.data.ncon):
-            contact = self.data.contact[number]
-            for side, sign in ((0, -1.0), (1, 1.0)):
-                geom = int(contact.geom[side])
-                if geom in self._module_of and (felt := self._touch(number, contact, geom, side, sign)) is not None:
-                    found.append(felt)
-        return found
+        if self._touching is None:
+            numbers, sides = np.nonzero(self._is_covered[self.data.contact.geom])
+            self._touching = self._touches(numbers, sides) if len(numbers) else []
+        return self._touching
 
     def newtons(self) -> list[ArrayF]:
         """Return (n, 3) the forces on each module's taxels in the newest step: shear along x and y, and normal, N.
@@ -134,34 +128,63 @@ class PhysicsScene:
             forces[number] = spread(self.modules[number], self.raw(number)[0], touches)
         return forces
 
-    def _touch(self, number: int, contact: Any, geom: int, side: int, sign: float) -> Touching | None:
-        force = np.zeros(6)
-        mujoco.mj_contactForce(self.model, self.data, number, force)
-        body = int(self.model.geom_bodyid[geom])
-        rotation = self.data.xmat[body].reshape(3, 3)
-        place = contact.pos
-        point = rotation.T @ (place - self.data.xpos[body])
-        frame = contact.frame.reshape(3, 3)
-        outward = rotation.T @ (-sign * frame[0])
-        reach = [distances(self.modules[m], point, outward).min() for m in self._module_of[geom]]
-        module = self._module_of[geom][int(np.argmin(reach))]
-        if min(reach) > self.modules[module].reach_m:
-            return None
-        shear = sign * (frame[1:].T @ force[1:3])
-        speeds, turning = [], np.empty(3)
-        for other in (geom, int(contact.geom[1 - side])):
-            six = np.zeros(6)
-            mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_GEOM, other, six, 0)
-            mujoco.mju_cross(turning, six[:3], place - self.data.geom_xpos[other])
-            speeds.append(six[3:] + turning)
-        slip = frame[1:] @ (speeds[1] - speeds[0])
-        return Touching(module, point, outward, float(force[0]), rotation.T @ shear, float(np.linalg.norm(slip)))
+    def _touches(self, numbers: npt.NDArray[np.intp], sides: npt.NDArray[np.intp]) -> list[Touching]:
+        """Return the contacts of these numbers, each felt at one of its two sides, that are near a module's taxels."""
+        geom = self.data.contact.geom[numbers, sides]
+        other = self.data.contact.geom[numbers, 1 - sides]
+        place = self.data.contact.pos[numbers]
+        frame = self.data.contact.frame[numbers].reshape(-1, 3, 3)
+        sign = np.where(sides == 0, -1.0, 1.0)[:, np.newaxis]
+        body = self.model.geom_bodyid[geom]
+        to_body = self.data.xmat[body].reshape(-1, 3, 3).transpose(0, 2, 1)
+        point = _turned(to_body, place - self.data.xpos[body])
+        outward = _turned(to_body, -sign * frame[:, 0])
+        force = np.zeros((len(numbers), 6))
+        for row, number in enumerate(numbers):
+            mujoco.mj_contactForce(self.model, self.data, number, force[row])
+        shear = sign * (force[:, 1:2] * frame[:, 1] + force[:, 2:3] * frame[:, 2])
+        slip = _turned(frame[:, 1:], self._velocities(other, place) - self._velocities(geom, place))
+        nearest, modules, rows = np.full(len(numbers), np.inf), [-1] * len(numbers), [np.empty(0)] * len(numbers)
+        for number, (module, feels) in enumerate(zip(self.modules, self._feels[:, geom], strict=True)):
+            felt = np.flatnonzero(feels)
+            if not len(felt):
+                continue
+            distance = distances(module, point[felt], outward[felt])
+            for row, of_row, reach in zip(felt.tolist(), distance, distance.min(axis=1).tolist(), strict=True):
+                if reach <= module.reach_m and reach < nearest[row]:
+                    nearest[row], modules[row], rows[row] = reach, number, of_row
+        shear, slip = _turned(to_body, shear), np.sqrt((slip * slip).sum(axis=1))
+        return [
+            Touching(module, point[row], outward[row], float(force[row, 0]), shear[row], float(slip[row]), rows[row])
+            for row, module in enumerate(modules)
+            if module >= 0
+        ]
+
+    def _velocities(self, geoms: npt.NDArray[np.intp], place: ArrayF) -> ArrayF:
+        """Return (n, 3) velocities of geoms at places, m/s; all in the world's frame."""
+        body = self.model.geom_bodyid[geoms]
+        turning, moving = self.data.cvel[body, :3], self.data.cvel[body, 3:]
+        x, y, z = (place - self.data.subtree_com[self.model.body_rootid[body]]).T
+        u, v, w = turning.T
+        velocities: ArrayF = moving + np.stack([v * z - w * y, w * x - u * z, u * y - v * x], axis=1)
+        return velocities
+
+
+def _turned(rotations: ArrayF, vectors: ArrayF) -> ArrayF:
+    turned: ArrayF = (rotations @ vectors[:, :, np.newaxis])[:, :, 0]
+    return turned
 
 
 def distances(taxels: BoundTaxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:
-    """Return (n,) distances of taxels from a contact, m; infinite for those that face another way."""
-    distance: ArrayF = np.linalg.norm(taxels.position_m - point_m, axis=1)
-    distance[taxels.axes[:, 2] @ normal < _SAME_WAY + _EPSILON] = np.inf
+    """Return (k, n) distances of n taxels from k contacts, m; infinite for taxels that face another way.
+
+    Args:
+        point_m: (k, 3) of the contacts.
+        normal: (k, 3) of them.
+    """
+    between = taxels.position_m - point_m[:, np.newaxis]
+    distance: ArrayF = np.sqrt((between * between).sum(axis=2))
+    distance[normal @ taxels.axes[:, 2].T < _SAME_WAY + _EPSILON] = np.inf
     return distance
 
 
@@ -174,17 +197,13 @@ def spread(taxels: BoundTaxels, depth_m: ArrayF, touches: Sequence[Touching]) ->
     Args:
         depth_m: (n,) by which the other bodies reach beyond each taxel.
     """
-    force_n = np.zeros((len(depth_m), 3))
-    distance = np.stack([distances(taxels, touch.point_m, touch.normal) for touch in touches], axis=1)
-    nearest = distance.argmin(axis=1)
-    for number, touch in enumerate(touches):
-        rows = np.flatnonzero((nearest == number) & (depth_m > 0) & np.isfinite(distance[:, number]))
-        weight = depth_m[rows]
-        if not len(rows):
-            rows = np.argsort(distance[:, number])[:_NEAREST]
-            weight = 1 / (distance[rows, number] + 1e-6)
-        share = (weight / weight.sum())[:, np.newaxis]
-        whole = taxels.axes[rows] @ touch.shear_n
-        whole[:, 2] = touch.normal_n
-        force_n[rows] += share * whole
+    distance = np.stack([touch.distance_m for touch in touches], axis=1)
+    is_nearest = distance.argmin(axis=1)[:, np.newaxis] == np.arange(len(touches))
+    weight = np.where(is_nearest & np.isfinite(distance), np.maximum(0.0, depth_m)[:, np.newaxis], 0.0)
+    for number in np.flatnonzero(weight.sum(axis=0) == 0):
+        rows = np.argsort(distance[:, number])[:_NEAREST]
+        weight[rows, number] = 1 / (distance[rows, number] + 1e-6)
+    share = weight / weight.sum(axis=0)
+    force_n = _turned(taxels.axes, share @ np.array([touch.shear_n for touch in touches]))
+    force_n[:, 2] = share @ np.array([touch.normal_n for touch in touches])
     return force_n

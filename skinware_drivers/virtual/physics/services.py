@@ -110,14 +110,11 @@ class WorldServices:
         scene = self._scene
         touches = scene.touching()
         columns = self._truth.begin(from_last=True)
-        columns["module_n"][:] = 0
-        for touch in touches:
-            columns["module_n"][touch.module] += touch.normal_n
+        modules, newtons = [touch.module for touch in touches], [touch.normal_n for touch in touches]
+        columns["module_n"][:] = np.bincount(modules, newtons, len(scene.modules))
         columns["force_n"][0] = columns["module_n"].sum()
-        for row, touch in enumerate(touches[:_MOST]):
-            columns["point_m"][row], columns["normal_n"][row] = touch.point_m, touch.normal_n
-            columns["shear_n"][row], columns["slip_m_s"][row] = touch.shear_n, touch.slip_m_s
-            columns["module"][row] = touch.module
+        for name in ("point_m", "normal_n", "shear_n", "slip_m_s", "module") if touches else ():
+            columns[name][: len(touches)] = [getattr(touch, name) for touch in touches[:_MOST]]
         columns["count"][0] = min(len(touches), _MOST)
         columns["touched_s"][0], columns["scene_s"][0] = scene.touched_s, scene.time_s
         columns["lag_s"][0] = (now_ns() - time_ns) / NS_PER_S

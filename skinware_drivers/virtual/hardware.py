@@ -17,12 +17,10 @@ if TYPE_CHECKING:
 
 
 Half = Literal["head", "tail"]
-FrameDamage = Literal["lost", "truncated", "corrupted", "repeated", "wrong_length", "unsent"]
+FrameDamage = Literal["lost", "truncated", "corrupted", "repeated", "unsent"]
 """``unsent``: the device lost its power, or its queue was full; no program received it either."""
 EventName = Literal[
-    "lost_half",
     "frame_fault",
-    "wrong_length",
     "burst_delayed",
     "board_died",
     "board_restarted",
@@ -42,11 +40,9 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     ======================  ============================================================================================
     event                   meaning, and fields besides ``time_ns``
     ======================  ============================================================================================
-    ``frame_fault``         a data frame was damaged: board, cycle, position, identifier, fault, payload; for a half of
-                            a triangle also triangle, half
-    ``lost_half``           no program received a half of a triangle: board, triangle, cycle, half, reason (``random``,
-                            ``overflow`` of the board's queue, ``died``, ``restarted``)
-    ``wrong_length``        a half of a triangle had a wrong ``length``: board, triangle, cycle, half, length
+    ``frame_fault``         a data frame was damaged: board, cycle, position, identifier, fault, payload; where no
+                            program received it, reason (``random``, ``overflow`` of the device's queue, ``died``,
+                            ``restarted``); for a half of a triangle also triangle, half
     ``burst_delayed``       a burst began ``delay_ns`` late, the next one on time: board, cycle, delay_ns
     ``board_died``          the board sends and hears nothing from now on: board
     ``board_restarted``     the board lost power for a moment and is deaf until ``ready_ns``: board, ready_ns

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from operator import itemgetter
-from typing import TYPE_CHECKING, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import msgspec
 import numpy as np
@@ -24,6 +24,13 @@ if TYPE_CHECKING:  # needs MuJoCo
 
 OptionsT = TypeVar("OptionsT", bound=EmulatorOptions)
 
+_FAULTS: dict[str, FrameDamage] = {
+    "lose": "lost",
+    "truncate": "truncated",
+    "corrupt": "corrupted",
+    "repeat": "repeated",
+}
+"""The damage that each option with a probability does to data frames."""
 _MOST_LISTED = 40
 _REPLY_NS = 200_000
 _LONGEST_CATCH_UP_NS = 1_000_000_000
@@ -38,7 +45,6 @@ class Stage(ABC, HasOptions[OptionsT]):
         numbered_by: name of the option that has these numbers, or the one number; empty: no option has them.
         counted: names of the totals besides ``frames`` of ``emit``, ``bursts`` of devices, ``commands`` that a device
             obeyed or answered, ``silenced`` frames, and ``unheard`` frames of ``skip``.
-        frame_faults: the damage that each option with a probability does to data frames.
         longest_queue: frames that a device keeps for the wire; more are lost.
         silent: kinds of frames that the devices do not send; see :meth:`kind_of`.
         world: the physics that presses the devices; None: they feel the option ``pattern``.
@@ -52,12 +58,6 @@ class Stage(ABC, HasOptions[OptionsT]):
     numbers: Sequence[int] = (0,)
     numbered_by: ClassVar[str] = ""
     counted: ClassVar[Sequence[str]] = ("lost", "repeated", "truncated", "corrupted", "foreign")
-    frame_faults: ClassVar[Mapping[str, FrameDamage]] = {
-        "lose": "lost",
-        "truncate": "truncated",
-        "corrupt": "corrupted",
-        "repeat": "repeated",
-    }
     longest_queue: ClassVar[int] = 256
 
     def __init__(self, options: OptionsT, *, log: EventLog | None = None) -> None:
@@ -140,7 +140,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         if ready_ns > time_ns:
             late = Event("burst_delayed", time_ns, board=device.number, cycle=device.cycle, delay_ns=ready_ns - time_ns)
             self.log.append(late)
-        chances = [getattr(self.options, name) for name in self.frame_faults]
+        chances = [getattr(self.options, name) for name in _FAULTS]
         lost: set[int] = set()
         if any(chances) or sum(map(len, device.queue)) + len(identifiers) > self.longest_queue:
             identifiers, payloads, lost = self._with_faults(device, identifiers, payloads, time_ns, chances)
@@ -327,16 +327,14 @@ class Stage(ABC, HasOptions[OptionsT]):
             self.counts["bursts"] += times
         return times
 
-    def spoil(self, fault: FrameDamage, payload: bytes, random: np.random.Generator) -> bytes:
-        """Return the payload of a frame after its fault."""
-        if fault == "truncated":
-            return payload[: int(random.integers(0, max(1, len(payload))))]
-        return random.bytes(len(payload)) if fault == "corrupted" else payload
+    def part_of(self, identifier: int, payload: bytes, position: int) -> Mapping[str, Any]:  # noqa: ARG002
+        """Return what a data frame of a burst is about, as fields of an event; by default nothing."""
+        return {}
 
-    def note_fault(self, fault: Event, reason: str) -> None:  # noqa: ARG002
-        """Count and log a ``frame_fault``; ``reason``: why the frame was lost."""
+    def _note_fault(self, fault: Event, payload: bytes) -> None:
         self.counts["lost" if fault.fault == "unsent" else str(fault.fault)] += 1
-        self.log.append(fault)
+        part = self.part_of(fault.identifier, payload, fault.position)
+        self.log.append(msgspec.structs.replace(fault, **part))
 
     def _with_faults(
         self,
@@ -347,7 +345,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         chances: Sequence[float],
     ) -> tuple[list[int], list[bytes], set[int]]:
         """Return the frames that go to the wire, and the positions of those that take their time there and are lost."""
-        faults = list(self.frame_faults.values())
+        faults = list(_FAULTS.values())
         hit = device.random.random((len(identifiers), len(faults))) < chances
         damage = partial(Event, "frame_fault", time_ns, board=device.number, cycle=device.cycle)
         sent_as: list[int] = []
@@ -359,10 +357,13 @@ class Stage(ABC, HasOptions[OptionsT]):
                 fault = "unsent"
             payload = whole
             if fault is not None:
-                payload = self.spoil(fault, whole, device.random)
-                reason = "overflow" if fault == "unsent" else "random"
-                event = damage(position=position, identifier=identifier, fault=fault, payload=payload.hex())
-                self.note_fault(event, reason)
+                if fault == "truncated":
+                    payload = whole[: int(device.random.integers(0, max(1, len(whole))))]
+                elif fault == "corrupted":
+                    payload = device.random.bytes(len(whole))
+                reason = {"unsent": "overflow", "lost": "random"}.get(fault)
+                what: dict[str, Any] = {"fault": fault, "reason": reason, "payload": payload.hex()}
+                self._note_fault(damage(position=position, identifier=identifier, **what), whole)
             if fault == "lost":
                 lost.add(len(sent_as))
             times = {"unsent": 0, "repeated": 2}.get(fault or "", 1)
@@ -376,7 +377,8 @@ class Stage(ABC, HasOptions[OptionsT]):
             lost = partial(Event, "frame_fault", now_ns, board=device.number, cycle=burst.cycle, fault="unsent")
             for at in range(burst.sent, len(burst.identifiers)):
                 if burst.cycle >= 0 and at not in burst.lost:
-                    identifier, payload = burst.identifiers[at], burst.payloads[at].hex()
-                    self.note_fault(lost(position=at, identifier=identifier, payload=payload), reason)
+                    identifier, payload = burst.identifiers[at], burst.payloads[at]
+                    event = lost(position=at, identifier=identifier, payload=payload.hex(), reason=reason)
+                    self._note_fault(event, payload)
         device.queue.clear()
         device.clear()

@@ -89,7 +89,7 @@ def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], 
                 read_until(reader, is_silent)
             stopped = driver.stop()
     events = [json.loads(line) for line in log.read_text().splitlines()]
-    halves = [(e["board"], e["triangle"], e["cycle"]) for e in events if e["event"] == "lost_half"]
+    halves = [(e["board"], e["triangle"], e["cycle"]) for e in events if e.get("fault") in ("lost", "unsent")]
     both = len(halves) - len(set(halves))
     orphans = sum(patch["orphans"] for patch in stopped["patches"])
     late = sum(patch["late"] for patch in stopped["patches"])

@@ -152,7 +152,7 @@ def test_every_status_of_a_sensor_is_told(status: Status) -> None:
 
 @pytest.mark.thorough
 def test_frames_without_partners_and_foreign_ones(skins: Skins) -> None:
-    skin = skins("roboskin", boards=(7, 8), lose=0.1, wrong_length=0.1, foreign_hz=500.0)
+    skin = skins("roboskin", boards=(7, 8), lose=0.1, truncate=0.1, foreign_hz=500.0)
     lost = found_until(of("patches", "without their partners"))
     assert lost.severity == Severity.WARNING
     assert "board 7: " in lost.evidence

@@ -149,7 +149,7 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
         told = running.status()["patches"]
         assert all(few <= patch["orphans"] for few, patch in zip(orphans, told, strict=True))
         assert len(damaged_cycles(log)) > 20
-    halves = Counter((e.board, e.triangle, e.cycle) for e in log if e.event == "lost_half")
+    halves = Counter((e.board, e.triangle, e.cycle) for e in log if e.fault in ("lost", "unsent"))
     both = [place for place, count in halves.items() if count == 2]
     # after a cycle that was lost whole, the next is not trusted
     damaged = {*damaged_cycles(log), *((board, triangle, cycle + 1) for board, triangle, cycle in both)}
@@ -159,7 +159,7 @@ def test_with_lost_halves_nothing_torn_is_fresh_and_every_loss_is_known() -> Non
         missing = {cycle for cycle in between if cycle not in cycles}
         assert missing == {c for b, t, c in damaged if (b, t) == (board, triangle) and c in between}
     total = sum(patch["orphans"] for patch in running.status()["patches"])
-    lost = sum(event.event == "lost_half" for event in log)
+    lost = sum(event.fault in ("lost", "unsent") for event in log)
     assert lost - 2 * len(both) - 4 <= total <= lost  # at most one head per board still waited at the end
 
 
@@ -238,7 +238,7 @@ def test_a_board_that_recalibrates_itself_is_suspect() -> None:
 
 @pytest.mark.usefixtures("hurry")
 def test_damaged_and_foreign_frames_are_counted() -> None:
-    bus = emulated(boards=(7,), wrong_length=0.05, foreign_hz=200)
+    bus = emulated(boards=(7,), truncate=0.05, foreign_hz=200)
     with driving(bus) as running, DriverReader("roboskin") as reader:
 
         def both_counted(frame: DriverSnapshot) -> bool:

@@ -47,6 +47,9 @@ class Rig:
     def events(self, kind: EventName) -> list[Event]:
         return [event for event in self.log if event.event == kind]
 
+    def lost(self) -> list[Event]:
+        return [event for event in self.events("frame_fault") if event.fault in ("lost", "unsent")]
+
     def streams(self, board: int = 7, period_ms: int = 50) -> bool:
         """Whether skin data of the board comes within four periods."""
         return any(is_data(frame, board) for frame in self.run_ms(4 * period_ms + 5))

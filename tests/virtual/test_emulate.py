@@ -333,7 +333,7 @@ def test_options_of_the_command_line_reach_the_emulator(
     assert lines[0]["options"]["boards"] == [7, 8]
     assert lines[0]["options"]["lose"] == 1.0
     assert lines[0]["options"]["streaming"] is True
-    assert lines[-1]["lost_halves"] == log.read_text().count('"lost_half"') > 32
+    assert lines[-1]["lost"] == log.read_text().count('"fault":"lost"') > 32
     assert host_buses[0].sent_frames == []
     assert not host_buses[0].is_open
 

@@ -37,7 +37,7 @@ def test_the_log_of_lost_halves_tells_exactly_which_modules_are_damaged() -> Non
     rig.send(0x208, "07 01")
     frames += rig.run_ms(20)
     totals = rig.hardware.totals()
-    lost = rig.events("lost_half")
+    lost = rig.lost()
     assert totals["bursts"] < 2 * 256  # cycle numbers are unique in the values
     assert 0.02 < len(lost) / (totals["bursts"] * 32) < 0.04
     assert len(frames) + len(lost) == totals["bursts"] * 32
@@ -50,13 +50,13 @@ def test_the_log_of_lost_halves_tells_exactly_which_modules_are_damaged() -> Non
     assert all((event.board, event.triangle, event.cycle, event.half) not in heard for event in lost)
     assert {event.half for event in lost} == {"head", "tail"}
     assert {event.reason for event in lost} == {"random"}
-    assert totals["lost_halves"] == len(lost)
+    assert totals["lost"] == len(lost)
 
 
 def test_losing_everything_leaves_silence_on_a_busy_wire() -> None:
     rig = Rig(streaming=True, lose=1.0)
     assert rig.run_ms(1000) == []
-    assert rig.hardware.totals()["lost_halves"] == 32 * rig.hardware.totals()["bursts"] > 0
+    assert rig.hardware.totals()["lost"] == 32 * rig.hardware.totals()["bursts"] > 0
 
 
 def test_a_lost_frame_takes_its_time_on_the_wire() -> None:
@@ -64,22 +64,15 @@ def test_a_lost_frame_takes_its_time_on_the_wire() -> None:
     assert {frame.time_ns for frame in lossy.run_ms(500)} < {frame.time_ns for frame in whole.run_ms(500)}
 
 
-def test_wrong_lengths_are_logged() -> None:
-    rig = Rig(streaming=True, wrong_length=0.05)
+def test_truncated_frames_are_logged() -> None:
+    rig = Rig(streaming=True, truncate=0.05)
     frames = rig.run_ms(5000)
-    logged = rig.events("wrong_length")
+    logged = rig.events("frame_fault")
     assert sorted(len(frame.payload) for frame in frames if len(frame.payload) != 8) == sorted(
-        event.length for event in logged
+        len(event.payload or "") // 2 for event in logged
     )
-    assert {event.length for event in logged} == {0, 1, 2, 3, 4, 5, 7}
-    assert rig.hardware.totals()["wrong_lengths"] == len(logged) > 100
+    assert rig.hardware.totals()["truncated"] == len(logged) > 100
     assert damaged_cycles(rig.log) == {(event.board, event.triangle, event.cycle) for event in logged}
-
-
-def test_wrong_lengths_of_old_firmware_are_not_its_own() -> None:
-    rig = Rig(streaming=True, wrong_length=0.5, short_tail=True)
-    rig.run_ms(1000)
-    assert 6 not in {event.length for event in rig.events("wrong_length")}
 
 
 def test_jitter_delays_single_bursts_and_does_not_add_up() -> None:
@@ -131,7 +124,7 @@ def test_dead_after_seconds_in_the_middle_of_a_burst() -> None:
     assert frames == [frame for frame in alive if frame.time_ns < death_ns]
     assert rig.events("board_died") == [Event("board_died", death_ns, board=7)]
     bursts = rig.hardware.totals()["bursts"]
-    assert len(frames) + len(rig.events("lost_half")) == 32 * bursts
+    assert len(frames) + len(rig.lost()) == 32 * bursts
     halves = halves_by_cycle(frames)
     assert damaged_cycles(rig.log) == {
         (7, triangle, bursts - 1) for triangle in range(16) if len(halves.get((7, triangle, bursts - 1), [])) < 2
@@ -144,7 +137,7 @@ def test_death_in_a_burst_loses_what_was_not_sent_yet() -> None:
     assert begin_ns is not None
     rig.hardware.kill(7, begin_ns + 4 * 130_000 + 1)
     assert len(rig.run_ms(1000)) == 5
-    lost = rig.events("lost_half")
+    lost = rig.lost()
     assert len(lost) == 27
     assert (lost[0].triangle, lost[0].half, lost[0].reason) == (2, "tail", "died")
     assert damaged_cycles(rig.log) == {(7, triangle, 0) for triangle in range(2, 16)}
@@ -156,7 +149,7 @@ def test_a_half_is_lost_only_once() -> None:
     assert begin_ns is not None
     rig.hardware.kill(7, begin_ns + 2 * MS)
     heard = len(rig.run_ms(1000))
-    lost = rig.events("lost_half")
+    lost = rig.lost()
     assert heard + len(lost) == 32
     assert len({(event.triangle, event.half) for event in lost}) == len(lost)
     assert {event.reason for event in lost} == {"random", "died"}
@@ -167,7 +160,7 @@ def test_dead_after_cycles() -> None:
     frames = rig.run_ms(2000)
     assert sum(is_data(frame, 8) for frame in frames) == 5 * 32
     assert sum(is_data(frame, 7) for frame in frames) > 30 * 32
-    assert not rig.events("lost_half")
+    assert not rig.lost()
 
 
 @pytest.mark.parametrize("mtb3", [(), (7,)])
@@ -334,10 +327,13 @@ def test_events_as_json_lines(tmp_path: Path) -> None:
     lines = [msgspec.json.decode(line) for line in path.read_bytes().splitlines()]
     log.close()
     log.close()
-    lost = [line for line in lines if line["event"] == "lost_half"]
-    assert len(lost) == hardware.totals()["lost_halves"] > 0
-    assert set(lost[0]) == {"event", "time_ns", "board", "triangle", "cycle", "half", "reason"}
-    assert {line["event"] for line in lines} == {"recalibrated", "lost_half"}
+    lost = [line for line in lines if line["event"] == "frame_fault"]
+    assert len(lost) == hardware.totals()["lost"] > 0
+    assert set(lost[0]) == {
+        *("event", "time_ns", "board", "triangle", "cycle", "position", "identifier"),
+        *("half", "fault", "reason", "payload"),
+    }
+    assert {line["event"] for line in lines} == {"recalibrated", "frame_fault"}
 
 
 def test_a_log_that_cannot_be_written(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_a_wire_sends_nothing_before_it_is_due() -> None:
 
 
 def test_frames_of_odd_lengths_take_their_own_time() -> None:
-    burst = cycles(Rig(streaming=True, wrong_length=0.5).run_ms(60))[0]
+    burst = cycles(Rig(streaming=True, truncate=0.5).run_ms(60))[0]
     for before, after in itertools.pairwise(burst):
         assert after.time_ns == before.time_ns + frame_time_ns(0x470, len(before.payload))
 
@@ -157,10 +157,10 @@ def test_a_period_shorter_than_the_burst_overflows_the_boards_queue_and_says_so(
     rig.configure(period_ms=2)
     frames = rig.run_ms(1000)
     assert 1000 / 0.13 * 0.98 < len(frames) <= 1000 / 0.13
-    lost = rig.events("lost_half")
+    lost = rig.lost()
     assert {event.reason for event in lost} == {"overflow"}
     totals = rig.hardware.totals()
-    assert totals["lost_halves"] == len(lost)
+    assert totals["lost"] == len(lost)
     waiting = totals["bursts"] * 32 - len(frames) - len(lost)
     assert 0 <= waiting <= 48
 

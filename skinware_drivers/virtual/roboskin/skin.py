@@ -7,17 +7,15 @@ The boards are silent until a host starts them, or the option ``streaming`` does
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
-from msgspec.structs import replace
 
 from skinware.geometry import Geometry
 from skinware_drivers.bus import EXTENDED_FLAG
 from skinware_drivers.virtual.device import DATA as BURSTS
 from skinware_drivers.virtual.device import Device
-from skinware_drivers.virtual.hardware import Event, EventLog, FrameDamage, Half, Point, Pressing
+from skinware_drivers.virtual.hardware import Event, EventLog, Point, Pressing
 from skinware_drivers.virtual.roboskin.boards import DATA, INERTIAL, EmulatedBoard
 from skinware_drivers.virtual.roboskin.converters import TriangleState
 from skinware_drivers.virtual.roboskin.mtb import Mtb3, Mtb4
@@ -33,8 +31,6 @@ from skinware_drivers.virtual.stage import Stage
 
 _CONFIGURED = (bytes.fromhex("4D0032F0"), bytes.fromhex("50000F02010022"), bytes.fromhex("0700"))
 """Set-up by a host: type 0, 50 ms, no load 240; all triangles, shift 2, offset 0x2200; start."""
-_WRONG_LENGTHS = (0, 1, 2, 3, 4, 5, 7)
-"""Neither 8 nor the 6 of old firmware."""
 
 
 class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
@@ -49,11 +45,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     numbered_by = "boards"
     longest_queue: ClassVar[int] = 48
     """icub-firmware:emBODY/eBcode/arch-arm/board/mtb4/application/src/main-appcan.cpp"""
-    counted: ClassVar[Sequence[str]] = (
-        *("lost_halves", "wrong_lengths", "foreign", "recalibrations"),
-        *("repeated", "truncated", "corrupted"),
-    )
-    frame_faults: ClassVar[Mapping[str, FrameDamage]] = {**Stage.frame_faults, "wrong_length": "wrong_length"}
+    counted: ClassVar[Sequence[str]] = (*Stage.counted, "recalibrations")
 
     def __init__(
         self, options: EmulatedRoboskinOptions, *, log: EventLog | None = None, source: WireSource | None = None
@@ -136,27 +128,9 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
             super().skipped(device, name, times)
         return frames
 
-    def spoil(self, fault: FrameDamage, payload: bytes, random: np.random.Generator) -> bytes:
-        if fault != "wrong_length":
-            return super().spoil(fault, payload, random)
-        length = int(random.choice(_WRONG_LENGTHS))
-        return payload[:length].ljust(length, b"\0")
-
-    def note_fault(self, fault: Event, reason: str) -> None:
-        """Count and log the fault of a half of a triangle."""
-        payload, triangle = bytes.fromhex(fault.payload or ""), fault.identifier & 0xF
-        half: Half = "tail" if (payload[0] & 0x80 if payload else fault.position % 2) else "head"
-        place = partial(
-            Event, time_ns=fault.time_ns, board=fault.board, triangle=triangle, cycle=fault.cycle, half=half
-        )
-        if fault.fault in ("lost", "unsent"):
-            self.counts["lost_halves"] += 1
-            self.log.append(place("lost_half", reason=reason))
-        elif fault.fault == "wrong_length":
-            self.counts["wrong_lengths"] += 1
-            self.log.append(place("wrong_length", length=len(payload)))
-        else:
-            super().note_fault(replace(fault, triangle=triangle, half=half), reason)
+    def part_of(self, identifier: int, payload: bytes, position: int) -> Mapping[str, Any]:
+        is_tail = payload[0] & 0x80 if payload else position % 2
+        return {"triangle": identifier & 0xF, "half": "tail" if is_tail else "head"}
 
     def foreign_identifiers(self, random: np.random.Generator) -> Sequence[int]:  # noqa: ARG002
         """Return identifiers of other devices on the bus, none of them from the address of an emulated board.

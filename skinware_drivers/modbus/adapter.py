@@ -43,6 +43,8 @@ _WORDS = {"byte_order": get_args(Order), "word_order": get_args(Order)}
 _UNHURRIED = 1.25
 """Factor on the time that bytes take: devices need some before they answer."""
 _LISTEN_S, _PERIODS, _LONGEST_LISTEN_S = 0.3, 4, 2.0
+_SILENT_S, _SLOWEST_CYCLE_S = 1.0, 10.0
+"""A device that sends nothing for so long is silent; longest cycle that is measured."""
 _ENOUGH_CYCLES, _TOO_SLOW = 4, 1.5
 
 
@@ -240,14 +242,18 @@ class ModbusAdapter(Adapter[OptionsT]):
         if not self.follows_line or self._line is None or self._line.is_recorded:
             return
         times: Counter[int] = Counter()
-        passed_s, cycles = 0.0, 0
-        while cycles < _ENOUGH_CYCLES and passed_s < _LONGEST_LISTEN_S:
+        passed_s, cycles, longest_s = 0.0, 0.0, _LONGEST_LISTEN_S
+        while cycles < _ENOUGH_CYCLES and passed_s < longest_s:
             step_s = max(_LISTEN_S, _PERIODS * self.period_s)
             for one, n in (await link.listen(step_s)).items():
                 times[one.identifier] += n
             passed_s += step_s
-            if not (cycles := max(times.values(), default=0)):
+            cycles = max(times.values(), default=0)
+            if not cycles and passed_s > _SILENT_S:
                 return
+            longest_s = _LONGEST_LISTEN_S if cycles > 1 else _SLOWEST_CYCLE_S
+        if cycles < _ENOUGH_CYCLES:
+            cycles = times.total() / max(1, len(times))
         if (cycle_s := passed_s / cycles) > _TOO_SLOW * self.period_s:
             link.log.info("a cycle takes about %.0f ms", 1e3 * cycle_s)
             self.period_s = _UNHURRIED * cycle_s

@@ -213,6 +213,7 @@ class ModbusBus(KernelBus):
                 name=self.name,
                 begun_ns=now_ns(),
                 guests=guests,
+                before=self._talk.unanswered if isinstance(self._talk, Master) else None,
             )
         self._wake()
 

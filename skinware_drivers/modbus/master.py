@@ -14,8 +14,8 @@ from skinware_drivers.counters import BusCounters
 from skinware_drivers.fields import Reply
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Guests
-from skinware_drivers.modbus.overdue import Overdue
 from skinware_drivers.modbus.registers import Image, Read, Wanted
+from skinware_drivers.modbus.unanswered import PROBE, Question, Unanswered
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.running.guard import Backoff, pauses_of_device
 
@@ -30,6 +30,8 @@ _MOST_TRIES = 3
 _MOST_COMMANDS = 64
 _COMMAND, _GUEST = -1, -2
 """In place of the number of a read: a question of the driver's own, and one of another program."""
+_OLD_NS = NS_PER_S
+"""Registers in a reply that is later are not used."""
 _MANUALS_COUNT_FROM = 30_001
 
 
@@ -40,15 +42,6 @@ class Timing(NamedTuple):
     timeout_ns: int
     turnaround_ns: int
     """From a reply to the next question."""
-
-
-class Open(NamedTuple):
-    """A question that waits for its reply."""
-
-    message: Message
-    read: int  # below 0: no read of the schedule
-    until_ns: int
-    tries: int
 
 
 class Schedule:
@@ -105,17 +98,18 @@ class Schedule:
 class Master:
     """Ask for the registers of a schedule, and in between for what the driver and other programs ask.
 
-    After a timeout, nothing is asked until the late reply has come or as much time again has passed; more if nothing
-    answers at all, as behind a slow link. On a serial line, a reply does not say which question it answers. Over TCP it
-    has the number of its question, but some servers, when two questions are open, answer the first with the number of
-    the second (pymodbus 3.16). So a reply that may answer an earlier question is dropped, with those that follow it.
+    After a timeout, nothing is asked until the late reply has come or as much time again has passed; more behind a slow
+    link. :class:`Unanswered` says which question a reply answers; one that may answer others, too, is dropped, with
+    those that follow it.
 
     Between two reads that are due, one question of other programs is asked. Those are never repeated.
 
     Args:
         over_tcp: the line is a connection, not a serial line.
+        before: the questions that another master asked on this line until now.
 
     Attributes:
+        unanswered: the questions whose replies may still come.
         rows: frames that have become whole; the reader removes them.
     """
 
@@ -129,6 +123,7 @@ class Master:
         name: str,
         begun_ns: int,
         guests: Guests | None = None,
+        before: Unanswered | None = None,
     ) -> None:
         self.rows: deque[Reply] = deque()
         self._timing, self._counters, self._name = timing, counters, name
@@ -136,13 +131,12 @@ class Master:
         self._image = Image(wanted)
         self._schedule = Schedule(wanted.reads(), timing.period_ns, begun_ns)
         self._line = wire.TcpMessages(counters.framing) if over_tcp else wire.RtuMessages(counters.framing)
-        self._number = 0  # of the last question; over TCP only
         self._commands: deque[Message] = deque()
-        self._open: Open | None = None
-        self._late: Open | None = None
-        self._overdue = Overdue(timing.timeout_ns)
-        self._again: Open | None = None
+        self.unanswered = Unanswered(timing.timeout_ns)
+        self._again: Question | None = None
         self._free_ns = begun_ns
+        if before is not None:
+            self.unanswered.inherit(before)
 
     def command(self, message: Message) -> bool:
         """Queue a question of the driver's own before the next read; return False if too many wait already."""
@@ -158,136 +152,126 @@ class Master:
     @property
     def due_ns(self) -> int | None:
         """Time of a timeout, of the end of a pause, or of the beginning of a cycle."""
-        if self._open is not None:
-            return self._open.until_ns
+        if self.unanswered.open is not None:
+            return self.unanswered.open.until_ns
         if self._commands or self._again is not None or self._schedule.is_within_cycle or self._guests.are_waiting:
             return self._free_ns
         return max(self._free_ns, self._schedule.deadline_ns) if self._schedule.reads else None
 
     def say(self, time_ns: int) -> bytes:
         """Return the bytes to be sent now; none if nothing is due."""
-        if self._open is not None and time_ns >= self._open.until_ns:
-            self._give_up(self._open, time_ns)
-        if self._open is not None or time_ns < self._free_ns:
+        asked = self.unanswered.open
+        if asked is not None and time_ns >= asked.until_ns:
+            self._give_up(asked, time_ns)
+        if self.unanswered.open is not None or time_ns < self._free_ns:
             return b""
-        if self._late is not None:
-            late = self._late
-            self._overdue.lose(late.message, self._asked_ns(late), may_be_mute=late.read >= 0)
-            self._late = None
-            self._drop_from_line()
-        if self._overdue.drains:
-            self._overdue.end()
+        if self.unanswered.drains:
+            self.unanswered.clear()
         if self._again is not None:
             again, self._again = self._again, None
-            return self._ask(again.message, again.read, time_ns, again.tries)
+            return self._ask_surely(again.message, again.read, time_ns, again.tries)
         if self._commands:
-            return self._ask(self._commands.popleft(), _COMMAND, time_ns)
+            return self._ask_surely(self._commands.popleft(), _COMMAND, time_ns)
         question = self._guests.next(time_ns, is_read_due=self._schedule.is_due(time_ns))
         if question is not None:
-            return self._ask(question, _GUEST, time_ns)
+            return self._ask_surely(question, _GUEST, time_ns)
         read = self._schedule.take(time_ns, self._counters)
-        return b"" if read is None else self._ask(self._schedule.questions[read], read, time_ns)
+        return b"" if read is None else self._ask_surely(self._schedule.questions[read], read, time_ns)
 
     def heard(self, chunk: bytes, time_ns: int) -> None:
-        """Take bytes that have come, and look for the reply.
+        """Take bytes that have come, and look for replies.
 
         Raises:
             ValueError: they are no Modbus, and bytes that follow could not be understood either.
         """
-        if self._overdue.drains:
-            self._overdue.hear()
         if isinstance(self._line, wire.TcpMessages):
             for message in self._line.feed(chunk):
-                asked, late = self._open, self._late
-                if asked is not None and (message.number, message.unit) == (asked.message.number, asked.message.unit):
-                    self._take_if_sure(asked, message, time_ns)
-                elif late is not None and message.number == late.message.number:
-                    self._take_if_sure(late, message, time_ns)
-                else:
-                    self._counters.refused += 1
+                self._take(message, time_ns)
             return
         self._line.feed(chunk)
-        asked = self._late or self._open
-        if asked is None:
-            self._line.drop()
-            return
         damaged = self._counters.framing.checksum_errors
-        found = self._line.reply_to(asked.message.unit, asked.message.data)
-        if found is not None:
-            was_late = asked is self._late
-            self._take_if_sure(asked, found, time_ns)
-            if not was_late:
-                self._line.drop()  # no unit may speak unasked
-        elif asked is not self._late and self._counters.framing.checksum_errors > damaged:
-            # bytes as long as the reply, which are none: ask again, once the line is silent
-            self._open, self._free_ns = None, time_ns + self._timing.turnaround_ns + _SILENCE_NS
-            if asked.read == _GUEST:
-                self._guests.answer(None, time_ns)
-            elif asked.tries < _MOST_TRIES:
-                self._again = asked
-
-    def _take_if_sure(self, asked: Open, message: Message, time_ns: int) -> None:
-        if self._overdue.confuses(asked.message):
-            self._open = self._late = None
-            self._free_ns = self._overdue.drain(self._asked_ns(asked), time_ns)
-            self._counters.refused += 1
-            self._schedule.retries.pop(("unit", message.unit), None)
-            if asked.read == _GUEST:
-                self._guests.answer(None, time_ns)
-            elif asked.read >= 0:
-                self._again = asked
-        elif asked is self._late:
-            self._take_late(asked, message, time_ns)
+        while not self.unanswered.drains and (asked := self.unanswered.messages):
+            found = self._line.reply_to(asked)
+            if found is None:
+                break
+            self._take(found, time_ns)
         else:
-            self._overdue.take(asked.message)
-            self._take(asked, message, time_ns)
+            self._line.drop()  # no unit may speak unasked
+        question = self.unanswered.open
+        if question is not None and self._counters.framing.checksum_errors > damaged:
+            # bytes as long as the reply, which are none: ask again, once the line is silent
+            self.unanswered.end_open()
+            self._free_ns = time_ns + self._timing.turnaround_ns + _SILENCE_NS
+            if question.read == _GUEST:
+                self._guests.answer(None, time_ns)
+            elif question.read != PROBE and question.tries < _MOST_TRIES:
+                self._again = question
 
-    def _asked_ns(self, asked: Open) -> int:
-        return asked.until_ns - self._timing.timeout_ns
-
-    def _take(self, asked: Open, message: Message, time_ns: int) -> None:
-        self._open = None
-        self._free_ns = time_ns + self._timing.turnaround_ns
-        self._schedule.retries.pop(("unit", message.unit), None)
-        if not wire.is_reply(asked.message.data, message.data):
+    def _take(self, message: Message, time_ns: int) -> None:
+        line = self.unanswered
+        asked = line.open
+        if line.drains:
+            self._counters.refused += 1
+            return
+        answered = line.take(message, time_ns, is_numbered=isinstance(self._line, wire.TcpMessages))
+        if answered is None:
+            if asked is None or (message.number, message.unit) != (asked.message.number, asked.message.unit):
+                self._counters.refused += 1
+                return
+            line.end_open()
+            self._free_ns = time_ns + self._timing.turnaround_ns
             self._counters.framing.refused += 1
             if asked.read == _GUEST:
                 self._guests.answer(None, time_ns)
-        elif asked.read == _GUEST:
-            self._guests.answer(message.data, time_ns)
-        elif asked.read == _COMMAND:
-            self.rows.append(Reply(time_ns, ANSWERS | message.unit, message.data))
-        elif code := wire.exception_of(message.data):
-            self._take_exception(asked, code, time_ns)
-        else:
-            self._schedule.retries.pop(("read", asked.read), None)
-            self._take_registers(asked.read, message, time_ns)
-
-    def _take_registers(self, position: int, message: Message, time_ns: int) -> None:
-        read = self._schedule.reads[position]
-        self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, self._schedule.cycle_ns)
-
-    def _take_late(self, asked: Open, message: Message, time_ns: int) -> None:
-        """Use a reply that came after its timeout: the device lives."""
-        self._late, self._free_ns = None, time_ns + self._timing.turnaround_ns
-        self._overdue.take_late(asked.message, time_ns - asked.until_ns)
-        self._counters.polls_late += 1
+            return
+        question = answered.question
         self._schedule.retries.pop(("unit", message.unit), None)
+        if not answered.is_sure:
+            self._counters.refused += 1
+            self._free_ns = line.drain(time_ns)
+            if asked is not None and asked.read == _GUEST:
+                self._guests.answer(None, time_ns)
+            elif asked is not None and asked.read >= 0:
+                self._again = asked
+            return
+        if line.open is None:
+            self._free_ns = time_ns + self._timing.turnaround_ns
+        if question is not asked:
+            self._count_late(question, time_ns)
+            if question.read >= 0 and time_ns - question.until_ns <= _OLD_NS and not wire.exception_of(message.data):
+                self._take_registers(question, answered.earliest_ns, message, time_ns)
+        elif question.read == _GUEST:
+            self._guests.answer(message.data, time_ns)
+        elif question.read == _COMMAND:
+            self.rows.append(Reply(time_ns, ANSWERS | message.unit, message.data))
+        elif question.read >= 0 and (code := wire.exception_of(message.data)):
+            self._take_exception(question, code, time_ns)
+        elif question.read >= 0:
+            self._schedule.retries.pop(("read", question.read), None)
+            self._take_registers(question, answered.earliest_ns, message, time_ns)
+
+    def _take_registers(self, asked: Question, earliest_ns: int, message: Message, time_ns: int) -> None:
+        read, cycle_ns = self._schedule.reads[asked.read], self._schedule.cycle_ns
+        is_of_cycle = earliest_ns >= cycle_ns
+        since_ns = cycle_ns if is_of_cycle else time_ns
+        self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, since_ns)
+        if not is_of_cycle:  # not to be joined with others of this cycle
+            self._image.areas[read.area].heard_ns[read.first : read.first + read.count] = earliest_ns
+
+    def _count_late(self, asked: Question, time_ns: int) -> None:
+        self._counters.polls_late += 1
         if self._counters.polls_late == 1:
             log.warning(
                 "%s: unit %d answers %.3g ms after timeout_s = %.3g ms, and others wait for it: make it longer, such as"
                 " ?timeout_ms=%.0f; logged once",
                 self._name,
-                message.unit,
+                asked.message.unit,
                 (time_ns - asked.until_ns) / 1e6,
                 self._timing.timeout_ns / 1e6,
-                2 * (time_ns - self._asked_ns(asked)) / 1e6,
+                2 * (time_ns - asked.asked_ns) / 1e6,
             )
-        is_good = wire.is_reply(asked.message.data, message.data) and not wire.exception_of(message.data)
-        if asked.read >= 0 and is_good:
-            self._take_registers(asked.read, message, time_ns)
 
-    def _take_exception(self, asked: Open, code: int, time_ns: int) -> None:
+    def _take_exception(self, asked: Question, code: int, time_ns: int) -> None:
         self._counters.errors += 1
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
             self._again, self._free_ns = asked, time_ns + _BUSY_NS
@@ -305,14 +289,15 @@ class Master:
             log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), advice)
         retry.begin(time_ns)
 
-    def _give_up(self, asked: Open, time_ns: int) -> None:
-        self._open = None
+    def _give_up(self, asked: Question, time_ns: int) -> None:
         self._counters.polls_unanswered += 1
-        if asked.read >= 0:
+        if asked.read >= 0 or asked.read == PROBE:
             self._schedule.retries["unit", asked.message.unit].begin(time_ns)
+        if asked.read == PROBE and self._again is not None:
+            asked, self._again = self._again, None
         if asked.read == _GUEST:
             self._guests.answer(None, time_ns)
-        self._late, self._free_ns = asked, time_ns + self._overdue.wait_ns
+        self._free_ns = time_ns + self.unanswered.give_up()
         self._drop_from_line()
 
     def _drop_from_line(self) -> None:
@@ -320,13 +305,21 @@ class Master:
         if isinstance(self._line, wire.RtuMessages):
             self._line.drop()
 
+    def _ask_surely(self, message: Message, read: int, time_ns: int, tries: int = 0) -> bytes:
+        """Ask a question, or first the one whose reply shows that no other can be taken for the reply to this one."""
+        probe = self.unanswered.probe_before(message)
+        if probe is None:
+            return self._ask(message, read, time_ns, tries)
+        self._again = Question(message, read, time_ns, time_ns, tries)
+        return self._ask(probe, PROBE, time_ns)
+
     def _ask(self, message: Message, read: int, time_ns: int, tries: int = 0) -> bytes:
         self._drop_from_line()
         over_tcp = isinstance(self._line, wire.TcpMessages)
         if over_tcp:
-            self._number = self._number % 0xFFFF + 1
-        message = message._replace(number=self._number)
-        self._open = Open(message, read, time_ns + self._timing.timeout_ns, tries + 1)
+            self.unanswered.number = self.unanswered.number % 0xFFFF + 1
+        message = message._replace(number=self.unanswered.number)
+        self.unanswered.ask(Question(message, read, time_ns, time_ns + self._timing.timeout_ns, tries + 1))
         self._counters.sent += 1
         return wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.master import Master, Open
+from skinware_drivers.modbus.master import Master
 from skinware_drivers.modbus.registers import Read
+from skinware_drivers.modbus.unanswered import Question
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.native import structs
 from skinware_drivers.serial.checksums import CRC16_MODBUS
@@ -60,21 +61,20 @@ class NativeMaster(Master):
         Returns:
             The address of C's state; None: only Python can do what comes next.
         """
-        schedule = self._schedule
-        is_late = self._late or not self._overdue.is_none
-        asks_otherwise = self._commands or self._again or is_late or schedule.retries or self._guests.are_waiting
-        is_unusual = self._open is not None and (self._open.read < 0 or self._open.tries > 1)
+        schedule, asked = self._schedule, self.unanswered.open
+        asks_otherwise = self._commands or self._again or schedule.retries or self._guests.are_waiting
+        is_unusual = not self.unanswered.is_usual or (asked is not None and (asked.read < 0 or asked.tries > 1))
         if not self._can or self._is_stuck or asks_otherwise or is_unusual or self.rows or self.pending:
             return None
         asker, counters = self._asker, self._counters
         asker.fd, asker.guests_fd, asker.is_stuck, asker.size = fd, guests_fd, 0, 0
         asker.open, asker.next = -1, schedule.next
-        if self._open is not None:
-            asker.open, asker.until_ns = self._open.read, self._open.until_ns
+        if asked is not None:
+            asker.open, asker.until_ns = asked.read, asked.until_ns
             if self._over_tcp:
-                row = ctypes.cast(asker.reads, ctypes.POINTER(structs.AskedRead))[self._open.read]
-                ctypes.memmove(row.reply, self._number.to_bytes(2, "big"), 2)
-        asker.number, asker.cycle, asker.free_ns = self._number, schedule.cycle, self._free_ns
+                row = ctypes.cast(asker.reads, ctypes.POINTER(structs.AskedRead))[asked.read]
+                ctypes.memmove(row.reply, self.unanswered.number.to_bytes(2, "big"), 2)
+        asker.number, asker.cycle, asker.free_ns = self.unanswered.number, schedule.cycle, self._free_ns
         asker.cycle_ns, asker.deadline_ns = schedule.cycle_ns, schedule.deadline_ns
         asker.sent, asker.polls_missed, asker.frames = counters.sent, counters.polls_missed, counters.frames
         framing = counters.framing
@@ -85,15 +85,16 @@ class NativeMaster(Master):
         """Go on from C's state; return the bytes that it has read and not understood."""
         asker, counters, schedule = self._asker, self._counters, self._schedule
         self._is_stuck = bool(asker.is_stuck)
-        self._number, schedule.cycle, schedule.next = asker.number, asker.cycle, asker.next
+        self.unanswered.number, schedule.cycle, schedule.next = asker.number, asker.cycle, asker.next
         self._free_ns, schedule.cycle_ns, schedule.deadline_ns = asker.free_ns, asker.cycle_ns, asker.deadline_ns
         counters.sent, counters.polls_missed, counters.frames = asker.sent, asker.polls_missed, asker.frames
         framing = counters.framing
         framing.bytes_in, framing.frame_bytes, framing.frames = asker.bytes_in, asker.frame_bytes, asker.found
-        self._open = None
+        self.unanswered.clear()
         if asker.open >= 0:
-            message = schedule.questions[asker.open]._replace(number=self._number if self._over_tcp else 0)
-            self._open = Open(message, asker.open, asker.until_ns, 1)
+            message = schedule.questions[asker.open]._replace(number=self.unanswered.number if self._over_tcp else 0)
+            asked_ns = asker.until_ns - self._timing.timeout_ns
+            self.unanswered.ask(Question(message, asker.open, asked_ns, asker.until_ns, 1))
         return self._buffer[: asker.size].tobytes()
 
     def _compile(self, read: Read) -> structs.AskedRead:

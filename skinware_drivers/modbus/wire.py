@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from skinware_drivers.counters import FramerCounters
@@ -99,6 +99,17 @@ def reply_size(question: bytes) -> int:
     return _ECHOING[question[0]]
 
 
+def echo_of(question: bytes) -> bytes:
+    """Return the beginning of a question that its good reply repeats."""
+    return question[: _ECHOING.get(question[0], 1)]
+
+
+def probe_of(question: bytes, count: int) -> bytes:
+    """Return a read of so many registers where a question reads or writes some."""
+    function = question[0] if question[0] in READS else READ_HOLDING
+    return question_to_read(function, int.from_bytes(question[1:3], "big"), count)
+
+
 def is_reply(question: bytes, reply: bytes) -> bool:
     """Return whether a message can be the reply to a question: a good one, or an exception."""
     if reply[:1] == bytes([question[0] | FAILED]):
@@ -174,17 +185,17 @@ class RtuMessages(_Messages):
         self._counters.bytes_in += len(chunk)
         self._rest += chunk
 
-    def reply_to(self, unit: int, question: bytes) -> Message | None:
-        """Return the reply to a question, if it has arrived; bytes before it are skipped."""
-        return self._first((unit, question), also_questions=False)
+    def reply_to(self, asked: Sequence[Message]) -> Message | None:
+        """Return the reply to one of these questions, if it has arrived; bytes before it are skipped."""
+        return self._first(asked, also_questions=False)
 
     def next_of(self, asked: Message | None) -> Message | None:
         """Return the next message on a line with another master: the reply to ``asked``, or a question."""
-        return self._first(None if asked is None else (asked.unit, asked.data), also_questions=True)
+        return self._first([] if asked is None else [asked], also_questions=True)
 
-    def _first(self, asked: tuple[int, bytes] | None, *, also_questions: bool) -> Message | None:
+    def _first(self, asked: Sequence[Message], *, also_questions: bool) -> Message | None:
         place, rest, was_damaged = 0, self._rest, False
-        beginning = _beginning_of(None if asked is None else (asked[0], asked[1][0]), also_questions)
+        beginning = _beginning_of(frozenset((each.unit, each.data[0]) for each in asked), also_questions)
         while place < len(rest):
             found = beginning.search(rest, place)  # on a babbling line hardly any byte begins a message
             if found is None:
@@ -192,7 +203,7 @@ class RtuMessages(_Messages):
                 break
             place = found.start()
             here = rest[place:]
-            sizes = [] if asked is None else _sizes_of_reply(here, *asked)
+            sizes = [size for each in asked for size in _sizes_of_reply(here, each.unit, each.data)]
             if also_questions:
                 sizes.append(_size_of_question(here))
             whole = [size for size in sizes if 0 < size <= len(here)]
@@ -213,11 +224,11 @@ class RtuMessages(_Messages):
 
 
 @functools.lru_cache(256)
-def _beginning_of(asked: tuple[int, int] | None, also_questions: bool) -> re.Pattern[bytes]:
+def _beginning_of(asked: frozenset[tuple[int, int]], also_questions: bool) -> re.Pattern[bytes]:
     beginnings = []
-    if asked is not None:
-        unit, function = (re.escape(bytes([number])) for number in asked)
-        failed = re.escape(bytes([asked[1] | FAILED]))
+    for numbers in asked:
+        unit, function = (re.escape(bytes([number])) for number in numbers)
+        failed = re.escape(bytes([numbers[1] | FAILED]))
         beginnings.append(unit + b"(?:" + function + b"|" + failed + b"|\\Z)")
     if also_questions:
         known = b"".join(re.escape(bytes([number])) for number in (*range(1, WRITE_ONE + 1), *_LENGTH_AT, _MASK))

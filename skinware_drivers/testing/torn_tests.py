@@ -41,7 +41,7 @@ _PACE_NS = 20_000
 _MOST_PLACES, _MOST_FRAMES = 32, 1024
 """Number of frames of a long burst that are tried as the first lost one, and frames of all variants of a burst."""
 _STUMBLING_PERIODS = 80
-_RECOVERY_S = 1.0
+_RECOVERY_S = 0.5
 """In it a driver gives up what it still waits for; one that asks has timeouts of many periods."""
 _WHAT_TO_DO = (
     "say in the layout's Cycle where its frames have a `counter`; where they have none, make `maximum_age_s` half a"

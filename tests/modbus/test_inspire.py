@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from skinware import DriverReader, DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.status import Status
 from skinware_drivers.description import assemble
+from skinware_drivers.link import Heard, Link
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.registers import Wanted
@@ -292,3 +294,23 @@ def test_a_matrix_that_shows_something_at_last_is_believed_from_then_on() -> Non
         felt[2] = 0
         frame = read_until(skin.reader, lambda frame: bool(frame.values[2] == 0) and is_current(frame))
         assert not frame.module_untouched[0]
+
+
+@pytest.mark.parametrize(("cycle_s", "period_s"), [(2.7, 3.4), (0.7, 0.9), (0.02, 0.02), (0.0, 0.02)])
+def test_the_period_follows_how_long_a_cycle_takes(cycle_s: float, period_s: float) -> None:
+    class Listening:
+        bus_name, log = "a bus", logging.getLogger("skinware.driver")
+        passed_s = 0.0
+
+        async def listen(self, duration_s: float) -> Counter[Heard]:
+            begun_s, self.passed_s = self.passed_s, self.passed_s + duration_s
+            heard = Counter[Heard]()
+            if cycle_s:
+                for read in range(int(begun_s / cycle_s * 9), int(self.passed_s / cycle_s * 9)):
+                    heard[Heard(read % 9, 0, 0)] += 1
+            return heard
+
+    driver = adapter()
+    driver.fit(make_bus("modbus:tcp://127.0.0.1:1"))
+    asyncio.run(driver.learn_period(cast("Link", Listening())))
+    assert driver.period_s == pytest.approx(period_s, rel=0.15)

@@ -11,7 +11,7 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.counters import BusCounters
 from skinware_drivers.fields import Reply
 from skinware_drivers.modbus import wire
-from skinware_drivers.modbus.master import ANSWERS, Listener, Talk
+from skinware_drivers.modbus.master import ANSWERS, Listener, Master, Talk, Timing
 from skinware_drivers.modbus.registers import Registers, Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.virtual.recorded import Conversation as RecordedConversation
@@ -156,10 +156,11 @@ def test_a_late_reply_is_known_by_its_number() -> None:
     late = talk.next_question()
     second = talk.next_question()
     assert talk.counters.polls_unanswered == 1
-    assert talk.registers(late) == []
-    assert talk.counters.refused == 1
+    assert [row.identifier for row in talk.registers(late)] == [0]
+    assert talk.counters.polls_late == 1
+    assert talk.registers(late) == []  # twice
     assert [row.identifier for row in talk.registers(second)] == [1]
-    assert talk.registers(second) == []  # twice
+    assert talk.registers(second) == []
     assert talk.counters.refused == 2
 
 
@@ -247,6 +248,65 @@ def test_registers_that_fall_silent_hide_no_others(over_tcp: bool, silent: set[i
         far.run(1000 * MS)
         assert {first for _, first in far.shown} == {100, 200, 300, 400, 500} - silent
         assert all(100 * (identifier + 1) == first for identifier, first in far.shown)
+
+
+@pytest.mark.parametrize("silence", [20 * MS, 333 * MS, 1000 * MS])
+def test_a_line_that_was_silent_is_shown_again_soon(over_tcp: bool, silence: int) -> None:
+    for phase in range(3):
+        far = Far(Conversation(*ALIKE, over_tcp=over_tcp), MS)
+        far.run((100 + 7 * phase) * MS)
+        far.silent = {100, 200, 300, 400, 500}
+        far.run(silence)
+        far.silent, far.shown = set(), []
+        far.run(250 * MS)
+        assert {identifier for identifier, _ in far.shown} == set(range(5))
+        assert all(100 * (identifier + 1) == first for identifier, first in far.shown)
+
+
+@pytest.mark.parametrize("answer", ["nothing", "an exception"])
+def test_devices_that_answer_no_probe_are_shown_again(over_tcp: bool, answer: str) -> None:
+    talk = Conversation(*ALIKE, over_tcp=over_tcp)
+    for _ in range(3):
+        talk.next_question()
+    end, shown = talk.now + 5000 * MS, set[int]()
+    while talk.now < end:
+        question = talk.next_question()
+        if question.data[-1] == 4:
+            shown |= {row.identifier for row in talk.registers(question, address_of(question))}
+        elif answer == "an exception":
+            talk.answer(question, b"\x83\x02")
+    assert shown == set(range(5))
+
+
+def test_a_late_reply_is_not_joined_with_registers_of_a_later_cycle() -> None:
+    talk = Conversation(Registers(0, 200), over_tcp=True)
+    talk.registers(talk.next_question())
+    late = talk.next_question()
+    first = talk.next_question()
+    while address_of(first) != 0:
+        first = talk.next_question()
+    talk.registers(first)
+    assert talk.registers(late, 125) == []
+
+
+def test_replies_to_questions_from_before_the_schedule_changed_are_shown_for_no_other_registers(over_tcp: bool) -> None:
+    talk = Conversation(*ALIKE, over_tcp=over_tcp)
+    before, late = talk.master.unanswered, talk.next_question()
+    talk.master = Master(
+        Wanted(ALIKE[1:]),
+        Timing(PERIOD, TIMEOUT, TURNAROUND),
+        talk.counters,
+        over_tcp=over_tcp,
+        name="bus",
+        begun_ns=talk.now,
+        before=before,
+    )
+    probe = talk.next_question()
+    assert talk.registers(late) == []
+    assert talk.registers(probe) == []
+    question = talk.next_question()
+    assert address_of(question) == 200
+    assert [row.identifier for row in talk.registers(question)] == [0]
 
 
 def test_without_a_late_reply_it_goes_on_after_a_while() -> None:

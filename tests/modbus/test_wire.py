@@ -73,7 +73,7 @@ def test_replies_on_a_line_are_found_in_whatever_pieces_and_behind_whatever_nois
     replies = []
     for at in range(0, len(stream), size):
         found.feed(stream[at : at + size])
-        if (reply := found.reply_to(1, READ_9)) is not None:
+        if (reply := found.reply_to([Message(1, READ_9)])) is not None:
             replies.append(reply)
     assert replies == [Message(1, REPLY_9)]
     assert (counters.frames, counters.skipped_bytes) == (1, len(noise))
@@ -88,7 +88,7 @@ def test_a_reply_with_a_flipped_bit_is_none() -> None:
         damaged = bytearray(good)
         damaged[bit // 8] ^= 1 << bit % 8
         found.feed(bytes(damaged))
-        assert found.reply_to(1, READ_9) is None
+        assert found.reply_to([Message(1, READ_9)]) is None
         assert counters.checksum_errors == 1
 
 
@@ -96,9 +96,9 @@ def test_replies_of_other_units_and_of_other_lengths_are_none() -> None:
     found = RtuMessages(FramerCounters())
     for other in (Message(2, REPLY_9), Message(1, b"\x03\x04abcd"), Message(1, b"\x04" + REPLY_9[1:])):
         found.feed(wire.rtu_frame(other))
-        assert found.reply_to(1, READ_9) is None
+        assert found.reply_to([Message(1, READ_9)]) is None
     found.feed(wire.rtu_frame(Message(1, b"\x83\x06")))
-    assert found.reply_to(1, READ_9) == Message(1, b"\x83\x06")
+    assert found.reply_to([Message(1, READ_9)]) == Message(1, b"\x83\x06")
 
 
 def test_what_is_no_modbus_ends_a_connection() -> None:
@@ -127,7 +127,7 @@ def test_noise_is_counted_and_never_raises_on_a_line() -> None:
     found, pending = RtuMessages(counters), 0
     for _ in range(3000):
         found.feed(noise.randbytes(noise.randrange(1, 40)))
-        found.reply_to(1, READ_9)
+        found.reply_to([Message(1, READ_9)])
         found.next_of(Message(1, READ_9))
         pending = len(found._rest)
         assert pending < 300
@@ -144,7 +144,7 @@ def test_a_line_that_babbles_is_hardly_looked_at(listens: bool, most: float, mon
     line = RtuMessages(counters)
     for start in range(0, len(noise), 64):
         line.feed(noise[start : start + 64])
-        while (line.next_of(Message(1, READ_9)) if listens else line.reply_to(1, READ_9)) is not None:
+        while (line.next_of(Message(1, READ_9)) if listens else line.reply_to([Message(1, READ_9)])) is not None:
             pass
     assert counters.skipped_bytes + counters.frame_bytes + line.pending == len(noise)
     assert looks.call_count < most * len(noise)

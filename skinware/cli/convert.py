@@ -146,9 +146,6 @@ _learning_options = cli.options(
         show_default=False,
         help="lerobot: rows at the times of a joined feature, such as a camera.",
     ),
-    click.option(
-        "--each-structure", is_flag=True, help="lerobot: a set for each structure of the drivers, in folders 1, 2 ..."
-    ),
 )
 _PROGRESS_S = 2.0
 _FORMATS = ("csv", "npz", "parquet", "hdf5", "mcap", "foxglove", "ros2")
@@ -305,7 +302,6 @@ def _learning_set(
         match=options["match"],
         within_s=options["within"],
         at=options["at"],
-        each_structure=options["each_structure"],
         by_marks=options["marks"],
         **{name: options[name] for name in ("form", "numbers", "size", "colours", "value_range", "resample", "video")},
     )

@@ -32,7 +32,6 @@ from skinware_drivers.doctor.evidence import (
     TaxelFault,
 )
 
-_HOUR_S = 3600
 _MOST_CHANGES = 500
 _MOST_NAMES = 3
 _JUDGE_EVERY_NS = 45_000_000
@@ -49,26 +48,16 @@ class _Growth:
         self.names = names
         self.now: Numbers = counts.astype(np.int64)
         self.grown: Numbers = np.zeros_like(self.now)
-        self.hours: dict[int, Numbers] = {}
 
-    def follow(self, counts: npt.NDArray[np.uint64], time_s: float) -> None:
+    def follow(self, counts: npt.NDArray[np.uint64]) -> None:
         """Add the counters of the next snapshot; one that is smaller than before has begun at 0 again."""
         now = counts.astype(np.int64)
-        by = np.where(now >= self.now, now - self.now, now)
+        self.grown += np.where(now >= self.now, now - self.now, now)
         self.now = now
-        if by.any():
-            self.grown += by
-            hour = int(time_s // _HOUR_S)
-            self.hours[hour] = self.hours.get(hour, 0) + by
 
-    def counted(self, row: int, *, by_hour: bool) -> Counted:
-        hours = sorted(self.hours.items()) if by_hour else ()
-
-        def named(counts: Numbers) -> dict[str, int]:
-            return dict(zip(self.names, counts[row].tolist(), strict=True))
-
-        by_hours = tuple((hour, named(counts)) for hour, counts in hours if counts[row].any())
-        return Counted(named(self.now), named(self.grown), by_hours)
+    def counted(self, row: int) -> Counted:
+        now, grown = (dict(zip(self.names, counts[row].tolist(), strict=True)) for counts in (self.now, self.grown))
+        return Counted(now, grown)
 
 
 class DriverLog:
@@ -79,10 +68,10 @@ class DriverLog:
         longest_gap_s: longest time between two of them.
     """
 
-    def __init__(self, structure: Structure, driver: str, *, by_hour: bool = False) -> None:
+    def __init__(self, structure: Structure, driver: str) -> None:
         self.structure = structure
         self.newest: DriverSnapshot | None = None
-        self._by_hour, self._frames = by_hour, 0
+        self._frames = 0
         self._future_ns = self._backwards = 0
         self.longest_gap_s = 0.0
         self._buses: _Growth | None = None
@@ -103,8 +92,8 @@ class DriverLog:
         if before is None or self._buses is None or self._patches is None:
             self._buses, self._patches = _Growth(bus_names, bus_counts), _Growth(patch_names, patch_counts)
         else:
-            self._buses.follow(bus_counts, time_s)
-            self._patches.follow(patch_counts, time_s)
+            self._buses.follow(bus_counts)
+            self._patches.follow(patch_counts)
             self._follow_times(before, frame)
         self._load = np.maximum(self._load, np.where(frame.bus_load == 0xFFFF, 0, frame.bus_load))
         self._follow_states(frame, time_s)
@@ -185,7 +174,7 @@ class DriverLog:
                     reason=changes[-1].reason,
                     since_s=(frame.published_ns - since_ns) / 1e9 if since_ns else None,
                     load=load_report(int(self._load[row]))["load"] if self._load[row] else None,  # type: ignore[arg-type]
-                    counted=self._buses.counted(row, by_hour=self._by_hour),
+                    counted=self._buses.counted(row),
                     samples=tuple(f"{one['why'].replace('_', ' ')}: {sample_text(one)}" for one in samples),
                     changes=changes,
                 )
@@ -213,7 +202,7 @@ class DriverLog:
                 modules=modules[row],
                 fresh=fresh[row],
                 age_ns=at_ns - int(newest_ns[row]) if newest_ns[row] else None,
-                counted=self._patches.counted(row, by_hour=self._by_hour),
+                counted=self._patches.counted(row),
                 interval=Histogram(self._times["patch_interval_counts"][row].tolist()),
                 delay=Histogram(self._times["patch_age_counts"][row].tolist()),
                 changes=tuple(self._states["patch", row]),

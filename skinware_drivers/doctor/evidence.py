@@ -22,12 +22,10 @@ class Counted:
     Attributes:
         total: since it exists; counters of a driver: since it was started.
         grown: during the look, or in the whole recording.
-        hours: (hour, growth) for each hour of a recording that has data; the first hour is 0.
     """
 
     total: Counts
     grown: Counts
-    hours: tuple[tuple[int, Counts], ...] = ()
 
 
 @dataclass(frozen=True)

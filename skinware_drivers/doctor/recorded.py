@@ -115,7 +115,7 @@ class _DriverTrack:
             driver_type = b"".join(bytes(text) for text in tables.get("driver_type", ())[:1])
             self._driver_type = driver_type.decode(errors="replace")
             if not self._logs or self._logs[-1].structure != frame.structure:
-                self._logs.append(DriverLog(frame.structure, self._name, by_hour=True))
+                self._logs.append(DriverLog(frame.structure, self._name))
         elif before is not None and frame.sequence == before.sequence + 1:  # without a loss between them
             interval_ns = frame.published_ns - before.published_ns
             self._live_ns += interval_ns
@@ -173,5 +173,5 @@ def _joined(part: _PartT, earlier: _PartT) -> _PartT:
     now: Counted = part.counted
     before: Counted = earlier.counted
     grown = dict(Counter(before.grown) + Counter(now.grown))
-    counted = Counted(now.total, grown, (*before.hours, *now.hours))
+    counted = Counted(now.total, grown)
     return replace(part, counted=counted, changes=(*earlier.changes, *part.changes))

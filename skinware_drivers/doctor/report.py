@@ -159,8 +159,4 @@ def _driver(driver: DriverSeen) -> Iterator[str]:
 def _counted(counted: Counted) -> str:
     """Return the counters that are not 0: total (growth during the look)."""
     counts = [f"{name} {count} (+{counted.grown.get(name, 0)})" for name, count in counted.total.items() if count]
-    hours = [
-        f"hour {hour + 1}: {', '.join(f'{name} {count}' for name, count in growth.items() if count)}"
-        for hour, growth in counted.hours
-    ]
-    return ", ".join(counts) + (f"; {'; '.join(hours)}" if len(hours) > 1 else "")
+    return ", ".join(counts)

@@ -17,7 +17,6 @@ from skinware_drivers.doctor.finding import Finding, Severity
 from skinware_drivers.operations import operations_of
 from skinware_drivers.registry import load_driver
 
-_MOST_HOURS = 3
 _SLOW_GOVERNORS = ("powersave", "conservative", "userspace")
 
 
@@ -71,12 +70,7 @@ def loss_seen(counted: Counted, name: str, unit: str, evidence: Evidence, beside
     text = f"{plural(grown, unit)} in {span}"
     if evidence.is_live and total > grown:
         text += f" ({count_text(total)} since the driver was started)"
-    text += beside
-    worst = sorted(((counts[name], hour) for hour, counts in counted.hours if counts.get(name)), reverse=True)
-    if worst and not evidence.is_live and evidence.seconds >= 3600:
-        hours = ", ".join(f"{count_text(count)} in hour {hour + 1}" for count, hour in worst[:_MOST_HOURS])
-        text += f"; most: {hours}"
-    return True, text
+    return True, text + beside
 
 
 def brief(bus_name: str) -> str:

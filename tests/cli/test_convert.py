@@ -68,7 +68,7 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["walk.mcap", "--to", "npz", "--regions", "r.toml"], 2, "choose regions with --region"),
         (["walk.mcap", "--to", "npz", "--start", "9"], 2, "no sample of the selection was recorded in that time"),
         (["walk.mcap", "--to", "npz", "--fps", "30"], 2, "--fps is for --to lerobot"),
-        (["walk.mcap", "--to", "npz", "--each-structure"], 2, "--each-structure is for --to lerobot"),
+        (["walk.mcap", "--to", "npz", "--video"], 2, "--video is for --to lerobot"),
         (["walk.mcap", "--to", "lerobot", "--fps", "0"], 2, "0 is not in the range"),
         (["walk.mcap", "--to", "lerobot", "--window", "0"], 2, "'0' is not a number of frames, nor all"),
         (["walk.mcap", "--to", "lerobot", "--episode", "2..1"], 2, "is not START..END in seconds"),

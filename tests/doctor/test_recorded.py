@@ -17,7 +17,7 @@ from skinware import BusState, PatchState, Status
 from skinware.errors import BadRecording
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.recording import Recording
-from skinware_drivers.doctor import driver_log, recorded
+from skinware_drivers.doctor import recorded
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.examining import examine
 from skinware_drivers.doctor.finding import Finding, Severity
@@ -99,26 +99,6 @@ def test_losses_states_and_silent_patches_over_time(tmp_path: Path) -> None:
     assert "1 sensor does not answer the microcontroller" in findings
     assert [change.state for change in evidence.drivers[0].buses[0].changes] == ["live", "gone", "live"]
     assert not any(command.startswith("skin-info") for finding in findings.values() for command in finding.commands)
-
-
-@pytest.mark.thorough
-def test_losses_by_the_hour(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(driver_log, "_HOUR_S", 0.1)
-    skin = FakeSkin("torso", fake_structure(1))
-
-    def lose() -> None:
-        skin.patch_counters[0] += np.array([90, 640], np.uint64)
-
-    file = tmp_path / "walk.mcap"
-    record(file, skin, lose, lambda: None, lose)
-    (patch,) = look_at(file).drivers[0].patches
-    assert [counts["orphans"] for _, counts in patch.counted.hours] == [90, 90]
-    hours = [hour for hour, _ in patch.counted.hours]
-    assert hours == sorted(set(hours))
-    monkeypatch.setattr(Recording, "duration_s", property(lambda _: 7200.0))
-    _, findings = seen(file)
-    evidence = findings["frames came without their partners, whose update was not shown"].evidence
-    assert f"90 in hour {hours[0] + 1}" in evidence
 
 
 def test_restarts_with_the_same_and_with_other_sensors(tmp_path: Path) -> None:

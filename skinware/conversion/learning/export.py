@@ -79,14 +79,12 @@ def convert_to_learning_set(
     notes: list[str] = []
     frames: Counter[str] = Counter()
     with contextlib.closing(_Recordings(paths, open_one)) as recordings:
-        sets = _sets(recordings, wanted, joined, notes)
+        episodes = _episodes(recordings, wanted, joined, notes)
         with begun_beside(target) as begun:
-            for number, episodes in enumerate(sets, 1):
-                folder = begun / str(number) if wanted.each_structure else begun
-                notes += _Set(recordings, wanted, joined, episodes).write(folder)
-                for episode in episodes:
-                    frames.update(dict.fromkeys(episode.frames, len(episode)))
-    return Converted(target, frames, notes, sum(map(len, sets)))
+            notes += _Set(recordings, wanted, joined, episodes).write(begun)
+        for episode in episodes:
+            frames.update(dict.fromkeys(episode.frames, len(episode)))
+    return Converted(target, frames, notes, len(episodes))
 
 
 class _Recordings:
@@ -112,12 +110,11 @@ class _Recordings:
             source.close()
 
 
-def _sets(
+def _episodes(
     recordings: _Recordings, wanted: LearningSet, joined: Sequence[Joined], notes: list[str]
-) -> list[list[Episode]]:
-    """The episodes of each dataset: those whose drivers have the same structures."""
+) -> list[Episode]:
     asked = _intervals(recordings.paths, wanted)
-    sets: list[list[Episode]] = []
+    episodes: list[Episode] = []
     structures: list[Structure] = []
     drivers: frozenset[str] | None = None
     for number, path in enumerate(recordings.paths):
@@ -134,21 +131,16 @@ def _sets(
             raise ConfigurationError(f"{source.path}: other drivers than the first recording ({there_are}): name some")
         drivers = planner.drivers
         for episode in planner.episodes(asked[number], wanted.task or path.stem):
-            for others in sets:
-                if others[0].piece.structures == episode.piece.structures:
-                    others.append(episode)
-                    break
-            else:
-                sets.append([episode])
-        if len(sets) > 1 and not wanted.each_structure:
-            when_s = (int(sets[1][0].times_ns[0]) - source.start_ns) / NS_PER_S
-            raise ConfigurationError(
-                f"{path}: a driver has another structure from {when_s:.3f} s on than before: --each-structure"
-            )
+            episodes.append(episode)
+            if episode.piece.structures != episodes[0].piece.structures:
+                when_s = (int(episode.times_ns[0]) - source.start_ns) / NS_PER_S
+                raise ConfigurationError(
+                    f"{path}: a driver has another structure from {when_s:.3f} s on than before: make another set of it"
+                )
         notes += [*source.problems, *planner.notes]
         left_out = sorted({table.service for table in source.tables if table.structure is None})
         notes += [f"{source.path}: {name} is left out: it has no sensors" for name in left_out]
-    return sets
+    return episodes
 
 
 def _intervals(paths: Sequence[Path], wanted: LearningSet) -> list[list[Interval]]:

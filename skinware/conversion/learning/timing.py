@@ -175,13 +175,11 @@ class Planner:
                 yield int(timed.times_ns[first + more]), int(timed.times_ns[end - 1])
 
     def _check_whole(self, pieces: Sequence[Stretch], where: str) -> None:
-        """Refuse a change of structure unless several sets are wanted."""
         changed = [piece for before, piece in pairwise(pieces) if piece.structures != before.structures]
-        if changed and not self._wanted.each_structure:
+        if changed:
             when = ", ".join(f"{self._seconds(piece.begin_ns):.3f} s" for piece in changed)
             raise ConfigurationError(
-                f"{self._path}: the structure of a driver changes in {where}, at {when}: choose a part by its time, or"
-                " --each-structure"
+                f"{self._path}: the structure of a driver changes in {where}, at {when}: choose a part by its time"
             )
 
     # -- episodes -------------------------------------------------------------------------------------------------

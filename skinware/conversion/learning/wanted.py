@@ -78,7 +78,6 @@ class LearningSet:
         match: which joined row belongs to a row: the newest at or before its time, or the nearest.
         within_s: greatest distance of a joined row; None: the time between two rows.
         at: name of a joined feature whose times are those of the rows; empty: a row each 1 / fps.
-        each_structure: write a set for each structure of the drivers, in folders; False: refuse several structures.
         by_marks: each mark in a recording begins an episode, whose task is its text; a mark ``end`` only ends one.
         form: ``tactile``: values, status and age of each driver; or in a form that stock policies of LeRobot read:
             ``state``: numbers in ``observation.state``, as the robot ``skinware`` has them; ``images``, as the camera
@@ -100,7 +99,6 @@ class LearningSet:
     match: Match = "previous"
     within_s: float | None = None
     at: str = ""
-    each_structure: bool = False
     by_marks: bool = False
     form: Literal["tactile", "state", "images", "points"] = "tactile"
     numbers: Each = "module"

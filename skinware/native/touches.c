@@ -80,6 +80,7 @@ static int64_t judge(struct baseline *b, double passed_s) {
     const struct baseline a = *b; /* no store can change it */
     const float passed = (float)passed_s, most_s = (float)b->maximum_hold_s;
     const float follows = (float)passed_share(passed_s, 1), rises = (float)passed_share(passed_s, PEAK_S);
+    const float eases = (float)passed_share(passed_s, USED_S); /* what falls more slowly was not let go */
     int64_t i, k, n_over = 0;
     b->n_touched = 0;
     for (i = 0; i < b->n; i++) {
@@ -103,7 +104,7 @@ static int64_t judge(struct baseline *b, double passed_s) {
         if (!a.live[i])
             continue;
         a.contact_s[i] += passed;
-        a.peak[i] += highest(load - a.peak[i], 0) * rises;
+        a.peak[i] += (load - a.peak[i]) * (load > a.peak[i] ? rises : eases);
         variance += a.gain[i] * a.gain[i] * (float)b->patches[a.patch[i]].variance;
         is_faded = fades(b, i, load, passed, follows);
         if (is_faded)
@@ -165,7 +166,8 @@ static void follow_steps(struct baseline *b, double passed_s) {
     if (b->is_signed || !find_new_modules(b, passed_s))
         return;
     for (i = 0; i < b->n; i++)
-        b->flag[i] = b->live[i] && b->modules[b->module[i]].looked > 0;
+        b->flag[i] = b->live[i] && b->modules[b->module[i]].looked > 0 &&
+                     (!b->touched[i] || b->contact_s[i] < 2 * LOOK_AT_S); /* older touches say nothing of it */
     medians(b, b->module, b->n_modules, b->deviation, b->flag, &b->modules->median, stride);
     medians(b, b->module, b->n_modules, b->slow, b->flag, &b->modules->slow, stride);
     medians(b, b->module, b->n_modules, b->on, b->flag, &b->modules->on, stride);
@@ -179,9 +181,10 @@ static void follow_steps(struct baseline *b, double passed_s) {
     for (k = 0; k < b->n_modules; k++) {
         struct module *m = &b->modules[k];
         const float median = (float)m->median, on = (float)m->on;
-        const int is_over = m->looked == LATER || fabs(m->onset - m->median) < AT_ONCE * m->median;
-        m->looked = m->number >= 4 && m->alike >= MOST_ALIKE * m->number && (float)m->slow < 0.3f * median && is_over &&
-                    median > OFF_TO_ON * on && median < STEP_OVER_ON / OFF_TO_ON * (float)m->off;
+        const int is_at_once = fabs(m->onset - m->median) < AT_ONCE * m->median;
+        const int is_step = is_at_once && (m->looked == LATER || m->onset > m->on); /* else a slow rise begins like one */
+        m->looked = m->number >= 4 && m->alike >= MOST_ALIKE * m->number && (float)m->slow < 0.3f * median &&
+                    is_step && median > OFF_TO_ON * on && median < STEP_OVER_ON / OFF_TO_ON * (float)m->off;
     }
     for (i = 0; i < b->n; i++) {
         const struct module *m = &b->modules[b->module[i]];

@@ -607,3 +607,32 @@ def test_a_hand_in_use_from_the_first_frame_takes_no_press_for_noise() -> None:
     assert baseline.ready.all()
     assert calm.noise.max() < 1
     assert calm.baseline == pytest.approx(12, abs=1)
+
+
+def test_a_hand_that_is_laid_down_within_a_second_is_no_step_of_its_boards() -> None:
+    bench = Bench()
+    bench.run(10)
+    load = on(*range(36)) / 25 * bench.random.uniform(8, 16, N)
+    for number in range(RATE_HZ):
+        bench.run(1 / RATE_HZ, load * number / RATE_HZ)
+    seen: list[float] = []
+    calm = bench.run(30, load, each=lambda calm: seen.append(float(calm.touched[:36].mean())))
+    assert min(seen) > 0.95
+    assert not calm.touched[36:].any()
+
+
+@pytest.mark.parametrize("per_min", [-1.0, 1.0])
+def test_a_bottle_that_is_emptied_slowly_is_held_to_the_end_and_then_let_go(per_min: float) -> None:
+    """Twelve minutes in which the patch drifts by as much as is left of the load, ten frames a second."""
+    random, held = np.random.default_rng(3), np.arange(24) % 4 == 0
+    baseline = Baseline(np.arange(24) // 12, np.zeros(24, int))
+    gain, seen = 1 + 0.15 * random.standard_normal(24), []
+    for number in range(7400):
+        time_s = number / 10
+        load = np.interp(time_s, [30, 31, 240, 660, 720, 720.3], [0, 30, 30, 9, 9, 0])
+        values = np.round(60 + gain * per_min / 60 * time_s + load * held + 0.8 * random.standard_normal(24))
+        calm = baseline.update(number * NS_PER_S // 10, values)
+        if 32 < time_s < 720:
+            seen.append(float(calm.touched[held].mean()))
+    assert np.mean(seen) > 0.97
+    assert not calm.touched.any()

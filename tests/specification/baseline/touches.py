@@ -18,6 +18,7 @@ from tests.specification.baseline.numbers import (
     PEAK_S,
     QUICK_S,
     STEP_OVER_ON,
+    USED_S,
 )
 from tests.specification.baseline.offsets import Grouping, Offsets
 from tests.specification.baseline.remainders import Remainders
@@ -104,7 +105,8 @@ class Touches:
         load = smooth[active]
         self.contact_s[active] += np.float32(passed_s)
         peak = self.peak[active]
-        self.peak[active] = peak + np.maximum(load - peak, 0) * np.float32(-math.expm1(-passed_s / PEAK_S))
+        rises, eases = (np.float32(-math.expm1(-passed_s / constant_s)) for constant_s in (PEAK_S, USED_S))
+        self.peak[active] = peak + (load - peak) * np.where(load > peak, rises, eases)
         variance = offsets.variance[active] + offsets.noise2[active] + (0.3 * self.remainders.left[active]) ** 2
         variance += offsets.gain[active] ** 2 * offsets.common.variance[self._patch[active]].astype(np.float32)
         is_over = load < off[active]
@@ -136,14 +138,16 @@ class Touches:
         looked, is_later = np.zeros(modules.n, bool), np.zeros(modules.n, bool)
         looked[modules.group[new]] = True
         is_later[modules.group[later]] = True
-        here = live & looked[modules.group]
+        here = live & looked[modules.group] & (~self.touched | (self.contact_s < 2 * LOOK_AT_S))
         median = modules.median(deviation, here)
-        at_once = np.abs(modules.median(self.onset, here & self._high) - median) < AT_ONCE * median
+        onset = modules.median(self.onset, here & self._high)
+        at_once = np.abs(onset - median) < AT_ONCE * median
+        at_once &= is_later | (onset > modules.median(on, here))
         sudden = modules.median(offsets.slow, here) < 0.3 * median
         around = np.maximum(ALIKE * modules.spread(median), 0.5 * on)
         near = here & (np.abs(deviation - modules.spread(median)) < around)
         number = modules.sum(here)
-        alike = (number >= 4) & (modules.sum(near) >= MOST_ALIKE * number) & sudden & looked & (at_once | is_later)
+        alike = (number >= 4) & (modules.sum(near) >= MOST_ALIKE * number) & sudden & looked & at_once
         alike &= median > OFF_TO_ON * modules.median(on, here)
         alike &= median < np.float32(STEP_OVER_ON / OFF_TO_ON) * modules.median(off, here)
         typical = modules.spread(median)

@@ -35,8 +35,6 @@ class Palette:
     Attributes:
         ramp: one colour for each level.
         stale: the same for stale values: darker, or grey.
-        no_value: colour of a sensor without a value.
-        settling: colour of a sensor whose baseline is not known yet.
         characters: one for each level where colours are not wanted, otherwise empty.
     """
 

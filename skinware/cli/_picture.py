@@ -46,8 +46,6 @@ class Picture:
     """The sensors of one type in one row of the list, drawn into a given space.
 
     Attributes:
-        scale_name: the meaning of the colours: ``change`` from rest, the type's ``range``, ``raw`` counts.
-        arrangement: places of sensors; None before the first ``draw``.
         pixels: (2 * lines, columns) uint8, codes of the pixels last drawn.
         marks: the meaning of the characters, with the number of sensors for each.
     """

@@ -49,7 +49,6 @@ def stream(namespace: Namespace, names: Collection[str], sink: Sink, rate_hz: fl
 
     Args:
         names: of the drivers; empty: all.
-        rate_hz: snapshots of a driver per second, at most.
     """
     calm = None if namespace.name == namespace.calm_name else Namespace(namespace.calm_name)
     follower, edition = Follower(Origin(namespace, tuple(names), calm)), 0
@@ -71,11 +70,7 @@ def stream(namespace: Namespace, names: Collection[str], sink: Sink, rate_hz: fl
 
 
 class RerunSink:
-    """Logs taxels as points, with their ``value`` in the unit of their type and their ``status``, and contacts.
-
-    Args:
-        recording: a ``rerun.RecordingStream``.
-    """
+    """Logs taxels as points, with their ``value`` in the unit of their type and their ``status``, and contacts."""
 
     def __init__(self, recording: rerun.RecordingStream) -> None:
         import rerun
@@ -113,11 +108,7 @@ class RerunSink:
 
 
 class FoxgloveSink:
-    """Logs the point clouds, images and states that recordings for Foxglove have.
-
-    Args:
-        context: of a server or file of ``foxglove``.
-    """
+    """Logs the point clouds, images and states that recordings for Foxglove have."""
 
     def __init__(self, context: foxglove.Context) -> None:
         import foxglove

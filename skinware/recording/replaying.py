@@ -194,7 +194,6 @@ class Replayer:
 
         Args:
             report: called about every ``every_s``.
-            every_s: time between two calls.
 
         Raises:
             NameInUse: a running driver or service has one of the names.

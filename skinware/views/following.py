@@ -40,7 +40,6 @@ class Origin:
     Contacts and motion may be in the namespace of calmed drivers, too.
 
     Args:
-        names: of the drivers; default: all.
         calm: namespace of calmed drivers; None: without it.
         recording: title of the recording that is published there; None: its drivers are live.
         is_beside: others are shown too, so that the names of its drivers need its title.
@@ -132,9 +131,6 @@ class ShownDriver:
 
     Attributes:
         generation: in which the driver began with this structure.
-        life: what it is doing; see :func:`skinware.state.life_of`.
-        newest: its newest snapshot; None before the first.
-        status: (n_sensors,) uint8, status of its sensors now.
         changes: grows with each snapshot and each change of the status.
         since_ns: when each of its problems was first seen, by what it is; see :func:`skinware.views.tree.problems_of`.
     """

@@ -175,7 +175,6 @@ class Memory:
         """Return the greatest change from rest seen lately, rounded up; it is forgotten slowly.
 
         Args:
-            key: of the kind of change.
             change: (k,) physical, 0 or more, of the sensors that count.
             noise: how far values move without a touch; the span is at least 8 times as large.
         """

@@ -133,7 +133,6 @@ class Look:
             where the highest level is as far as a touch moves them.
         quantity: name of the quantity; None: the first of the first driver.
         scale: values of the lowest and the highest level; None: as they fit.
-        fps: pictures a second, at most.
     """
 
     def __init__(self) -> None:

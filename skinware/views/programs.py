@@ -30,9 +30,6 @@ class RecordingProgram:
 
     Args:
         program: that records until its standard input is closed, with the arguments of ``skin-record``.
-        namespace: to record.
-        names: of the drivers; default: everything.
-        folder: of the files.
 
     Attributes:
         problem: why the last recording ended by itself; None: it did not.
@@ -113,7 +110,6 @@ class DoctorProgram:
 
     Args:
         program: that prints findings, with the arguments of ``skin-doctor``; empty: none.
-        namespace: to examine.
 
     Attributes:
         findings: those of the last examination, as ``skin-doctor --json`` has them; empty while there are no problems.

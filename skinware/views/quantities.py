@@ -50,7 +50,6 @@ class Pads(NamedTuple):
 
     Attributes:
         of_sensor: (n_sensors,) int64.
-        names, module: of each pad.
         is_on_hand: (n_sensors,) bool.
     """
 
@@ -71,7 +70,6 @@ class Quantity:
         where: the same, as a slice if it is one.
         axes: names of the types of the two axes within the skin; empty where the skin has no such sensors.
         shear: (n, 2) int64, positions of the sensors of these axes, -1 without one.
-        pads: of all sensors of the driver.
     """
 
     name: str
@@ -242,7 +240,6 @@ class Newest:
     Attributes:
         status: (n_sensors,) uint8, status of its sensors now, with the health that the calmed driver publishes.
         calm: snapshot of the calmed driver, if it lives and has the same sensors.
-        read_all: returns ``all``.
         contacts, motion: on the driver; None where no service publishes them.
         shared: results that several viewers need, by a key of their own.
     """

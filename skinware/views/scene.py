@@ -45,7 +45,6 @@ def shape_of(kind: str, count: int) -> ModuleShape:
 
     Args:
         kind: of the module: ``triangle``, ``fingertip``, rows and columns as ``4x6``; any other is drawn as a block.
-        count: number of its sensors that are drawn.
     """
     known = _BY_KIND.get((kind, count))
     if known is not None:
@@ -117,9 +116,6 @@ class Scene:
     own in a nominal frame, and where its taxels would lie on those of another driver. The first body of a frame with a
     pose is placed by that pose, and the first other body by its own coordinates. All further bodies stand beside them
     in the order of their drivers, then taxels without places. So nothing covers anything else.
-
-    Args:
-        drivers: structure and quantities of each driver, by name, in the order in which they are to stand.
     """
 
     def __init__(

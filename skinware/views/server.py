@@ -59,7 +59,6 @@ class ViewServer:
         doctor: that is asked for advice; None: without it.
         files: recordings that viewers may see instead; each plays them for itself.
         is_framed: pages of this machine, such as notebooks, may contain the page.
-        tls: encrypts all connections.
     """
 
     def __init__(
@@ -87,7 +86,6 @@ class ViewServer:
 
         Args:
             port: to listen at; 0: any.
-            ready: called with the port when browsers can connect.
         """
         server = await serve(
             self._attend,

@@ -112,9 +112,6 @@ class Outline:
 class PlayedRecording:
     """A recording that a thread publishes again in a namespace of its own, paused at its begin.
 
-    Args:
-        title: of the recording.
-
     Attributes:
         began_s: when the recording began, s since 1970.
         state: as :meth:`skinware.recording.replaying.Replayer.replay` returns it.
@@ -212,7 +209,6 @@ class Show:
     Args:
         played: recordings whose namespaces the follower follows; empty: it follows living drivers, among which a
             ``skin-replay`` may be.
-        problems: reasons why something is not shown.
     """
 
     def __init__(
@@ -262,13 +258,7 @@ class Show:
 
 
 class RecordingFiles:
-    """The recordings that viewers may see: some files, and all others in their folders.
-
-    Args:
-        files: that were chosen.
-        folder: of other recordings.
-        names: of the drivers to show; default: all.
-    """
+    """The recordings that viewers may see: some files, and all others in their folders."""
 
     def __init__(self, files: Sequence[Path] = (), folder: Path | None = None, names: Sequence[str] = ()) -> None:
         self._files = {str(file): file for file in files}

@@ -76,11 +76,7 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ConfigFile:
-    """A configuration file, or none; errors name file, line and key.
-
-    Args:
-        path: of the file; None: all settings have their defaults.
-    """
+    """A configuration file, or none; errors name file, line and key."""
 
     def __init__(self, path: Path | None) -> None:
         self._text = TomlText(path)
@@ -111,12 +107,7 @@ class ConfigFile:
         given: Mapping[str, str] | None = None,
         usual: Mapping[str, Any] | None = None,
     ) -> T:
-        """Return a driver's options for one bus: given texts override the bus' own options, these the common ones.
-
-        Args:
-            struct: the driver's ``Options``.
-            given: texts by name of option, as of a command line.
-        """
+        """Return a driver's options for one bus: given texts override the bus' own options, these the common ones."""
         number, of_bus = next(
             ((i, bus.options) for i, bus in enumerate(self.settings.bus) if bus.name == bus_name), (0, {})
         )

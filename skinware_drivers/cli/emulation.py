@@ -104,7 +104,6 @@ class Emulation:
         hardware: not powered up yet.
         clock: CLOCK_MONOTONIC ns.
         poll: waits until a descriptor is readable, or for a time: ``(descriptors, timeout_s)``.
-        pressing: lets programs press it.
     """
 
     def __init__(

@@ -61,12 +61,7 @@ class _Growth:
 
 
 class DriverLog:
-    """Sum up the snapshots of one structure of a driver.
-
-    Attributes:
-        newest: the last one; None before the first.
-        longest_gap_s: longest time between two of them.
-    """
+    """Sum up the snapshots of one structure of a driver."""
 
     def __init__(self, structure: Structure, driver: str) -> None:
         self.structure = structure

@@ -64,12 +64,9 @@ class PatchSeen:
     """A patch of a driver at the end.
 
     Attributes:
-        state: in the words of ``skin-info``.
-        sensors, modules, fresh: how many it has, and how many of its sensors are fresh.
         age_ns: age of its newest data; None: it never sent any.
         interval: times between two updates of a module.
         delay: ages of updates when they were published.
-        changes: of its state; the first one is the state at the beginning.
     """
 
     name: str
@@ -100,7 +97,6 @@ class HealthSeen:
 
     Attributes:
         source: the judge: ``skin-calm`` or ``these frames``.
-        judged: number of taxels of which something is known.
         missing: reasons why something could not be judged, by the kind of fault.
     """
 
@@ -118,12 +114,10 @@ class DriverTiming:
         rate_hz: rate of its snapshots; None: unknown.
         late: delays of its periods.
         age: ages of the newest data when it was published.
-        missed: periods that it missed.
         period_ns: nominal; 0: none.
         future_ns: the most by which data was stamped later than it was published; 0: never.
         backwards: times that the times of a module went backwards.
         before_boot: snapshots that were stamped before the machine was started.
-        longest_gap_s: longest time between two snapshots.
     """
 
     rate_hz: float | None
@@ -147,8 +141,6 @@ class DriverSeen:
         pid: of its process; 0: unknown.
         scheduling: of its process, in words; empty: unknown.
         data_path: ``native``, ``mixed``, ``python`` or ``not_told``.
-        restarts: during the look, or in the recording.
-        frames, frames_missed: snapshots that were seen, and those that are missing in the recording.
         statuses: number of sensors with each status at the end, ``fresh`` first.
         affected: names of some sensors of each status but ``fresh``.
         lines: names of the rows and columns of matrices that were never good.
@@ -185,9 +177,7 @@ class NamespaceSeen:
     Attributes:
         is_ours: it is the one to examine.
         problem: the reason why it cannot be read; empty: it can.
-        damaged: errors of files that cannot be read.
         living, dead: names of services whose writer lives, and of those whose writer was killed.
-        idle_s: time since a service last came or went.
     """
 
     name: str
@@ -206,8 +196,6 @@ class MachineSeen:
     """The machine and its software.
 
     Attributes:
-        versions: of skinware, Python, numpy ..., by name.
-        kernel: release and processor architecture.
         load: number of processes that are ready to run, mean of the last minute.
         governors: of the processors, each once; empty: none, or unknown.
         memory_bytes, memory_available_bytes: 0: unknown.
@@ -285,11 +273,8 @@ class Evidence:
         machine: this one; nothing is known of the machine that recorded.
         recording: None: a running skin was examined.
         interfaces: CAN interfaces of the kernel at the end, and the counters of the kernel and of their controllers.
-        kernel_has_can: the kernel supports CAN.
         running: living drivers in all namespaces that may be read, without those that publish another driver's data.
         waiting: processes of ``skin-driver`` that have published nothing so far.
-        readers: programs that read the drivers snapshot by snapshot.
-        bridges: running bridges that bring services into the namespace.
     """
 
     seconds: float

@@ -21,11 +21,6 @@ class Finding:
 
     Attributes:
         area: such as ``buses``; filled in by :func:`skinware_drivers.doctor.examining.examine`.
-        what: the fault in a few words.
-        where: the part of the skin or machine.
-        evidence: the figures that show it.
-        action: what to do, in words.
-        commands: what to type.
         see: page and section of the documentation, below ``docs/``.
     """
 
@@ -50,12 +45,7 @@ class Looked:
 
 @dataclass(frozen=True)
 class NotLooked:
-    """Something that could not be examined.
-
-    Attributes:
-        area: as in :class:`Finding`.
-        commands: what to type to find out.
-    """
+    """Something that could not be examined."""
 
     area: str = field(default="", kw_only=True)
     what: str

@@ -33,7 +33,6 @@ class IdentifierClass:
     Attributes:
         name: ``4xx``: 11-bit identifiers 400 to 4FF; ``29-bit``: all of those.
         first, last: the lowest and the highest that was heard.
-        identifiers: number of different identifiers.
     """
 
     name: str
@@ -115,7 +114,6 @@ def known_drivers(medium: str, only: Collection[str] = ()) -> dict[str, type[Any
     """Return drivers for a kind of bus, by name.
 
     Args:
-        medium: kind of bus, ``can``.
         only: drivers, as ``load_driver`` takes them; none: all that are registered and can be loaded.
     """
     found = {short_name(name): load_driver(name) for name in only}

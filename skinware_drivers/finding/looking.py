@@ -29,11 +29,9 @@ class HeardOnBus:
 
     Attributes:
         problem: the reason why it cannot be read; else empty.
-        rate_hz: frames per second.
         load: share of the bus' time, 0 to 1; None: the bit rate is unknown.
         trouble: state of the controller if something is wrong: ``error-passive``.
         dropped: number of frames that were read too late.
-        guesses: drivers that know the frames.
     """
 
     bus: str
@@ -54,9 +52,7 @@ class ProbeAnswer:
     """The answers on a bus.
 
     Attributes:
-        asked: drivers that asked.
         answers: devices in words, by driver.
-        problems: errors, by driver.
         refused: the reason why no driver asked; else empty.
     """
 
@@ -129,7 +125,6 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> ProbeA
 
     Args:
         path: of the port; or the name of a bus over a network, or of Modbus.
-        drivers: that may ask, for serial devices or for Modbus.
     """
     asked: list[str] = []
     answers: dict[str, str] = {}

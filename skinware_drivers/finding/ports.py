@@ -57,10 +57,8 @@ class SerialPort:
         driver: of the kernel: ``ftdi_sio``, ``cdc_acm``.
         usb: None: the port is not on USB.
         links: other names, which do not change with the order of plugging in.
-        may_open: this user may read and write.
         group: its members may open it; empty: none.
         in_group: this user is a member, perhaps not yet in this session.
-        users: processes that have it open.
         users_known: all processes could be examined; False: there may be other users.
         latency_ms: latency timer of FTDI; None: it has none.
     """

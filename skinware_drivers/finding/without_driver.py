@@ -83,7 +83,6 @@ async def carry_out(
         bus: not opened yet.
         arguments: of the operation; ``patch``: name of the only patch.
         agree: called with the patches before anything is changed; may raise.
-        force: make changes even if frames are heard.
 
     Returns:
         The result of the operation.

@@ -65,7 +65,6 @@ def judge(matrix: Matrix, down: Floats, across: Floats, threshold: float) -> Ord
     Args:
         down: (frames, n) distance of each taxel from its rest while a finger went over the rows.
         across: the same while it went over the columns.
-        threshold: least distance of an answer.
     """
     heard = (_peak(down) > threshold) & (_peak(across) > threshold)
     silent = np.flatnonzero((_peak(down) <= threshold) & (_peak(across) <= threshold))

@@ -57,7 +57,6 @@ class Manner:
 
     Attributes:
         only: press the modules with one of these words in their names; empty: all.
-        with_tare: let the driver tare at the end, if it can.
     """
 
     type_name: str | None = None

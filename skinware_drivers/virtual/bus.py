@@ -52,7 +52,6 @@ class EmulatedBus(Bus):
 
     Args:
         payload_size: longest payload of the driver's frames; longer ones are counted as refused.
-        listen_only: refuse every ``send``.
         hardware: devices that exist already, instead of ``channel`` and ``options``.
         clock: stamps what comes, and makes the timer behind ``fileno``.
     """

@@ -40,8 +40,6 @@ class Transmission:
 
     Attributes:
         ready_ns: when the first of them can go.
-        identifiers: of each frame.
-        payloads: of each frame.
         lost: positions of frames that take their time on the wire without being heard.
         usual: all have 8 bytes and 11-bit identifiers.
         cycle: number of the burst; -1 if this is none.
@@ -149,7 +147,6 @@ class ForeignTraffic:
     Args:
         rate_hz: more than 0.
         counts: totals, of which ``foreign`` is counted.
-        now_ns: when the devices begin.
     """
 
     def __init__(

@@ -42,7 +42,6 @@ class WanderingPress:
 
     Args:
         number: of the device; devices with other numbers feel other presses.
-        places: of its sensors.
     """
 
     def __init__(self, seed: int, number: int, places: Places) -> None:

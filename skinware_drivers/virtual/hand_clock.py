@@ -94,8 +94,6 @@ class HandClock:
 
     Attributes:
         before_passing: called before every jump, when everything of this moment has happened.
-        turns: of the event loop so far.
-        timers: those that are open.
     """
 
     def __init__(self) -> None:

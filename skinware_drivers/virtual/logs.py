@@ -96,7 +96,6 @@ class LoggedWire:
 
     Attributes:
         driver: empty: a log does not have it.
-        bus: its name.
     """
 
     driver = ""
@@ -125,11 +124,7 @@ class LoggedWire:
 
 
 class _CountedText(io.TextIOWrapper):
-    """Lines of a log without error frames, which python-can takes for data.
-
-    Attributes:
-        number: of the last line.
-    """
+    """Lines of a log without error frames, which python-can takes for data."""
 
     number = 0
 

@@ -169,11 +169,8 @@ class ReplayedModbusBus(ModbusBus):
     """A recorded Modbus line or connection. It asks nothing, because the recording has the questions.
 
     Args:
-        channel: its name, as a user writes it.
         hardware: the recording, in both directions.
         over_tcp: it was a connection.
-        payload_size: longest frame.
-        listen_only: refuse every ``send``.
     """
 
     opens_slowly = False
@@ -264,10 +261,7 @@ def replayed_bus(
     """Make the bus ``replay`` or ``file`` of a bus in the file ``channel``, a recording or a log of another program.
 
     Args:
-        options: see :class:`ReplayOptions`.
-        payload_size: longest payload of the layout.
         listen_only: refuse to send, and wait for no question.
-        clock: of the replay.
         note: is called for each frame; see :class:`.recorded_wire.RecordedWire`.
     """
     wanted = options_from_strings(ReplayOptions, options or {})

@@ -35,9 +35,6 @@ _AT_ONCE = 2048
 class Questions:
     """The questions of this driver, by identifier, and the recorded ones that they meet.
 
-    Args:
-        waits: recorded questions are waited for.
-
     Attributes:
         last_ns: when this driver asked last.
         is_unanswered: the answer to the last question that met a recorded one has not come.
@@ -94,10 +91,6 @@ class RecordedWire:
         waits: for the questions that were asked in the recording.
         with_sent: return sent items too, with the identifier :data:`SENT`.
         name: for the log message at the end; empty: none.
-        note: is called for each returned item.
-
-    Attributes:
-        is_over: every item was returned.
     """
 
     def __init__(

@@ -31,9 +31,6 @@ class TextSource(ColumnSource):
 
     Names of columns are in its first line; without one they are ``column_0``, ``column_1`` ... Separators are tabs,
     semicolons (then a comma is a decimal point), commas, or any white space.
-
-    Args:
-        path: of the text, in UTF-8.
     """
 
     def __init__(self, path: Path) -> None:

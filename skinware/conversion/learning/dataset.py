@@ -46,7 +46,6 @@ class DatasetWriter:
     Args:
         folder: of the dataset; it must not exist.
         fps: rows a second.
-        video: images are written as videos.
     """
 
     def __init__(

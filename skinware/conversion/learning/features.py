@@ -201,11 +201,7 @@ class Frames:
 
 
 class JoinedFeature:
-    """A feature of joined data.
-
-    Args:
-        joined: numbers, or paths of images.
-    """
+    """A feature of joined data."""
 
     def __init__(self, joined: Joined) -> None:
         self._joined, self.name = joined, joined.name
@@ -312,8 +308,6 @@ class ChosenRows:
     """Evenly chosen rows of those that are added.
 
     Args:
-        shape: of a row.
-        dtype: of its numbers.
         rows: number of rows to come.
         most_bytes: of the rows to keep.
     """

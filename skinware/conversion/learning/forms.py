@@ -27,10 +27,6 @@ class SetForm:
     """Touch in one of these forms, made of the features of each driver.
 
     A value whose status is not good is 0. With several sensor types, names have that of the type.
-
-    Args:
-        wanted: definition of the set.
-        structures: of the drivers, by name in order.
     """
 
     def __init__(self, wanted: LearningSet, structures: Mapping[str, Structure]) -> None:

@@ -22,8 +22,6 @@ class Video:
     """The video of one feature in one episode.
 
     Args:
-        path: of the new file.
-        fps: images a second.
         shape: height, width and channels of the images.
     """
 

@@ -140,7 +140,6 @@ def intervals_of_marks(source: TableSource, end_s: float) -> list[Interval]:
     """Return the episodes at the marks of a recording: from each to the next, or to the end.
 
     Args:
-        source: the recording.
         end_s: time at which it ends, s since it began.
     """
     marks = [

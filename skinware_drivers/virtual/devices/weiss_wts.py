@@ -33,7 +33,6 @@ def cut_commands(heard: bytes, *, bare_when_empty: bool = False) -> tuple[list[b
     """Return the whole commands, by the length in each, and the rest.
 
     Args:
-        heard: bytes of the line.
         bare_when_empty: a command without payload has no checksum.
     """
 

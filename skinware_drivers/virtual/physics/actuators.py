@@ -24,7 +24,6 @@ class Actuators:
     """The targets of a scene's actuators.
 
     Attributes:
-        names: of the actuators.
         poses: targets of actuators, by name of the pose.
         commanded_s: time of the scene at the newest command from outside; NaN: there was none.
     """

@@ -28,10 +28,8 @@ class Touching(NamedTuple):
     """One contact of a module in the newest step.
 
     Attributes:
-        module: number of the module.
         point_m: (3,) in the frame of its body, m.
         normal: (3,) outwards, in the same frame.
-        normal_n: N.
         shear_n: (3,) in the same frame, on the module, N.
         slip_m_s: speed of the other body along the surface, m/s.
         distance_m: (n,) of the module's taxels from it, m; infinite for those that face another way.
@@ -51,10 +49,7 @@ class PhysicsScene:
 
     Attributes:
         model: MuJoCo's model, with a tactile sensor for each geom under taxels.
-        data: MuJoCo's state.
         modules: the taxels, in the order of the binding.
-        actuators: what moves in it.
-        joints: names of its joints.
         touched_s: time of the scene when the present touch of modules began; NaN: nothing touches them.
     """
 

@@ -37,7 +37,6 @@ class BoundTaxels:
 
     Attributes:
         binding: where they come from.
-        body: number of the body.
         geoms: (k,) numbers of its geoms that touch others.
         position_m: (n, 3) in the frame of the body, m.
         axes: (n, 3, 3) x, y and outward normal of each, in the same frame, as rows.

@@ -34,7 +34,6 @@ class TransferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         creep, remainder, creep_s: as of :class:`skinware.tactile.testing.Response`.
         noise: standard deviation, counts.
         drift: amplitude of a slow wave, counts; each taxel has a phase of its own.
-        drift_s: its period.
         warmth: counts per kelvin.
         warming_k: by how much the device warms up in the end, K.
         warming_s: time constant of that.

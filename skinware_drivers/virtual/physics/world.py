@@ -26,12 +26,10 @@ class PhysicsWorld:
     """A scene that presses the devices of one emulator.
 
     Args:
-        seed: of the errors of the devices.
         speed: seconds of the scene in a second of the devices.
         has_services: publish the services ``truth`` and ``joints``.
 
     Attributes:
-        scene: the physics.
         origin_ns: when the scene was at 0 s; later, once it has left time out.
         left_out_s: time of the scene that it left out because nothing called it.
     """

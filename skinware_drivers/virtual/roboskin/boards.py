@@ -124,10 +124,8 @@ class EmulatedBoard(Device):
 
     Args:
         address: on the bus, the ``number`` of the device, which commands can change.
-        now_ns: time of power-up.
         phase: 0-1, when in its period a started board sends its first burst.
         skin: of all boards, with the presses on it.
-        source: the values of every burst, instead of felt ones.
 
     Attributes:
         command_bytes: bytes of each command; shorter ones are ignored here, real boards read old bytes of their buffer.

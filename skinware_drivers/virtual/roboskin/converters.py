@@ -155,7 +155,6 @@ def triangle_payloads(sample: FirmwareSample, *, short_tail: bool) -> list[list[
     HEAD is 0x40 and taxels 0-6; TAIL is 0xC0, taxels 7-11 and the diagnostics, high byte first.
 
     Args:
-        sample: of the board.
         short_tail: leave the diagnostics out, as old firmware does.
     """
     block = np.empty((len(sample.values), TRIANGLES, 2, 8), np.uint8)

@@ -37,7 +37,6 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     """Emulated boards on one bus.
 
     Args:
-        log: receives each :class:`skinware_drivers.virtual.hardware.Event`, for example a list.
         source: called for every triangle of every burst as ``source(board, triangle, cycle, time_ns)``; its 12 values
             0-255 go on the wire instead of felt ones. Flags stay true.
     """

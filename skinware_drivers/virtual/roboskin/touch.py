@@ -145,7 +145,6 @@ class PressedSkin:
     Attributes:
         origin_ns: beginning of the stage file's time.
         version: changes when the touch from now on does, other than with time.
-        physics: the world that presses it; its touch is known only now.
     """
 
     def __init__(self, options: EmulatedRoboskinOptions, physics: PhysicsWorld | None = None) -> None:
@@ -307,7 +306,6 @@ class Touch:
         """Return (n, 16, 12) readings of the converters, 1-65534.
 
         Args:
-            times_ns: (n,) of the acquisitions.
             cycles: (n,) of the board, for the noise.
             cdc_offset: (16, 1) offset of the converters, subtracted count for count (assumed: its real scale is not
                 known, and vanishes with the next calibration).

@@ -309,7 +309,11 @@ class SkinTop(App[None]):
 
     def _say(self, where: str, text: str | Text) -> None:
         """Show a text, which may come from others, in a line of the screen."""
-        line, text = self._lines[where], _printable(text)
+        line = self._lines[where]
+        if isinstance(text, str):
+            text = printable(text, "\n")
+        else:
+            text.plain = printable(text.plain, "\n")
         if line.content != text:
             line.update(text, layout=where not in _FIXED and len(str(line.content)) != len(str(text)))
 
@@ -391,11 +395,3 @@ def _state_of(driver: LiveDriver) -> tuple[object, ...]:
     """Return what rows of a driver are made of; no age of a part changes before that of the driver."""
     frame = driver.frame
     return driver.name, life_of(driver.reader, frame), frame, None if frame is None else age_text(frame.age_ns)
-
-
-def _printable(text: str | Text) -> str | Text:
-    """Return a text of others as :func:`skinware.text.printable` does; its colours stay."""
-    if isinstance(text, str):
-        return printable(text, "\n")
-    text.plain = printable(text.plain, "\n")
-    return text

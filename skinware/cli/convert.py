@@ -218,8 +218,12 @@ def command(
     from skinware.conversion import Selection, convert, convert_wires
 
     if guess:
+        from skinware.conversion.foreign import guess as guess_map
+        from skinware.conversion.foreign import open_source
+
         cli.refuse_others("--guess", ["file"])
-        _print_guess(file)
+        with contextlib.closing(open_source(file)) as source:
+            echo(guess_map(source), nl=False)
         return
     if format_name is None:
         raise click.UsageError("Missing option '--to'.")
@@ -251,13 +255,6 @@ def command(
         return
     frames = ", ".join(f"{count} frames of {name}" for name, count in converted.frames.items())
     echo(f"{converted.path}: {frames}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
-
-
-def _print_guess(file: Path) -> None:
-    from skinware.conversion.foreign import guess, open_source
-
-    with contextlib.closing(open_source(file)) as source:
-        echo(guess(source), nl=False)
 
 
 def _imported(

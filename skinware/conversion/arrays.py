@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
 from skinware.conversion.tables import Output, Table, TableSource, cannot_hold, outputs, package, sensor_table
 
@@ -39,17 +38,13 @@ def write_npz(source: TableSource, path: Path) -> None:
             made = outputs(table)
             for output in made:
                 _write_streamed(archive, table, output, rows)
-            for name, array in _sensors(table).items():
-                with archive.open(f"{table.name}/{name}.npy", "w") as file:
+            for name, array in sensor_table(table).items():
+                with archive.open(f"{table.name}/sensors/{name}.npy", "w") as file:
                     np.lib.format.write_array(file, array, allow_pickle=False)
             units.append({output.name: output.unit for output in made if output.unit})
         with archive.open(f"{_DESCRIPTION}.npy", "w") as file:
             text = description(source, units).decode()
             np.lib.format.write_array(file, np.array(text), allow_pickle=False)
-
-
-def _sensors(table: Table) -> dict[str, npt.NDArray[Any]]:
-    return {f"sensors/{name}": array for name, array in sensor_table(table).items()}
 
 
 def _write_streamed(archive: zipfile.ZipFile, table: Table, output: Output, rows: int) -> None:

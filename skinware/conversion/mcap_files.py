@@ -75,9 +75,12 @@ def write_recording(source: TableSource, path: Path) -> None:
         ((each["log_time_ns"], partial(writer.add_json, EVENTS, each)) for each in source.events),
         ((each["log_time_ns"], partial(writer.add_json, CLOCK, each)) for each in source.clock),
     ]
+    begun_ns = 0
     try:
         for time_ns, add in heapq.merge(*items, key=itemgetter(0)):
-            writer.close_chunk_before(time_ns)
+            if writer.pending.is_large or time_ns >= begun_ns + _CHUNK_NS:
+                writer.close_chunk()
+                begun_ns = time_ns
             add()
         writer.close_chunk()
     finally:
@@ -96,33 +99,26 @@ class _RecordingWriter:
         self._file = file
         self._channels = Channels()
         self._streams: dict[str, _CodedStream] = {}
-        self._pending, self._begun_ns = PendingChunk(), 0
+        self.pending = PendingChunk()
 
     def add_frame(self, timed: TimedFrame) -> None:
         stream = self._streams.get(timed.service)
         if stream is None or stream.generation is not timed.generation:
-            stream = self._streams[timed.service] = self._stream(timed.service, timed.generation, stream)
+            number = 1 if stream is None else stream.head.sequence + 1
+            channel, schema = self._channels.of_service(timed.service, GENERATION)
+            head = Head(channel, schema, number, timed.generation.head)
+            stream = _CodedStream(head, timed.generation, FrameEncoder(timed.generation.coded))
+            self._streams[timed.service] = stream
         channel, schema = self._channels.of_service(timed.service, FRAME)
-        self._pending.add_sample(channel, schema, timed.frame, timed.time_ns, stream.encoder, stream.head)
+        self.pending.add_sample(channel, schema, timed.frame, timed.time_ns, stream.encoder, stream.head)
 
     def add_json(self, topic: str, entry: dict[str, Any]) -> None:
         channel, schema = self._channels.of_all(topic)
         data = {name: value for name, value in entry.items() if name != "log_time_ns"}
-        self._pending.chunk.add(channel, schema, 0, entry["log_time_ns"], json.dumps(data).encode())
-
-    def close_chunk_before(self, time_ns: int) -> None:
-        """End the chunk at hand if a message of a time is not to be in it."""
-        if self._pending.is_large or time_ns >= self._begun_ns + _CHUNK_NS:
-            self.close_chunk()
-            self._begun_ns = time_ns
+        self.pending.chunk.add(channel, schema, 0, entry["log_time_ns"], json.dumps(data).encode())
 
     def close_chunk(self) -> None:
-        self._pending.move_to(self._file)
-
-    def _stream(self, service: str, generation: Generation, before: _CodedStream | None) -> _CodedStream:
-        number = 1 if before is None else before.head.sequence + 1
-        channel, schema = self._channels.of_service(service, GENERATION)
-        return _CodedStream(Head(channel, schema, number, generation.head), generation, FrameEncoder(generation.coded))
+        self.pending.move_to(self._file)
 
 
 _MESSAGE_CHUNK_BYTES = 4 << 20
@@ -223,6 +219,13 @@ class _MessageWriter:
 
     def metadata(self, name: str) -> str:
         """Return the text of rosbag2's metadata.yaml for a file of this name."""
+        topics = []
+        for channel, (topic, type_name) in self._types.items():
+            topics += [
+                f"    - topic_metadata: {{name: {_quoted(topic)}, type: {_quoted(type_name)},",
+                '        serialization_format: cdr, offered_qos_profiles: ""}',
+                f"      message_count: {self._file.counts[channel]}",
+            ]
         begin_ns = min(self._begin_ns, self._end_ns)
         times = [
             ("duration", f"{{nanoseconds: {self._end_ns - begin_ns}}}"),
@@ -231,7 +234,7 @@ class _MessageWriter:
         ]
         lines = ["rosbag2_bagfile_information:", f"  version: {_BAG_VERSION}", "  storage_identifier: mcap"]
         lines += [f"  {key}: {value}" for key, value in times]
-        lines += ["  topics_with_message_count:", *self._topics()]
+        lines += ["  topics_with_message_count:", *topics]
         lines += [
             '  compression_format: ""',
             '  compression_mode: ""',
@@ -240,12 +243,6 @@ class _MessageWriter:
         ]
         lines += ["  files:", f"    - path: {_quoted(name)}", *(f"      {key}: {value}" for key, value in times[::-1])]
         return "\n".join(lines) + "\n"
-
-    def _topics(self) -> Iterator[str]:
-        for channel, (topic, type_name) in self._types.items():
-            yield f"    - topic_metadata: {{name: {_quoted(topic)}, type: {_quoted(type_name)},"
-            yield '        serialization_format: cdr, offered_qos_profiles: ""}'
-            yield f"      message_count: {self._file.counts[channel]}"
 
     def _close_chunk(self) -> None:
         if not self._chunk.is_empty:

@@ -16,7 +16,6 @@ from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.state import LIVE, PAUSED, STARTING, DriverReport, life_of, report_of, status_now
 from skinware.status import Status
-from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
 from skinware.tactile.motion import MotionReader, MotionSample
 from skinware.tactile.source_service import SourceReader
@@ -213,8 +212,11 @@ class ShownDriver:
     def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8], *, is_newer: bool = False) -> Newest:
         self._judged_ns = now_ns()
         calm, contacts, motion = self.origin.about(self.live.name)
-        if calm is not None and not self._fits(calm.structure):
-            calm = None
+        if calm is not None and not (
+            np.array_equal(calm.structure.sensor_uid, self.structure.sensor_uid)
+            and np.array_equal(calm.structure.sensor_type, self.structure.sensor_type)
+        ):
+            calm = None  # it has other sensors
         if calm is not None:
             status = status | (calm.status & _UNHEALTHY)
         origin, last = self.origin, calm or frame
@@ -222,11 +224,6 @@ class ShownDriver:
         before = (self.newest.calm or self.newest.frame).position if self.newest is not None else None
         read_all = partial(self._every.until, last, namespace, before) if is_newer else lambda: [last]
         return Newest(frame, status, calm, contacts, motion, read_all)
-
-    def _fits(self, calm: Structure) -> bool:
-        """Return whether a calmed driver has the same sensors."""
-        own = self.structure
-        return np.array_equal(calm.sensor_uid, own.sensor_uid) and np.array_equal(calm.sensor_type, own.sensor_type)
 
 
 class Follower:

@@ -167,7 +167,6 @@ class DriverSeen:
     patches: tuple[PatchSeen, ...]
     timing: DriverTiming
     health: HealthSeen | None = None
-    frames_missed: int = 0
 
 
 @dataclass(frozen=True)

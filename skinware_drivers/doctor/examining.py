@@ -45,15 +45,18 @@ class Examination:
 def examine(evidence: Evidence) -> Examination:
     """Run all checks on what was seen; texts become printable, and commands that are of no use are left out."""
     notes: list[Note] = []
-    elsewhere = evidence.namespace if evidence.namespace not in ("", Namespace().name) else ""
+    is_elsewhere = evidence.namespace not in ("", Namespace().name)
+
+    def whole(command: str) -> str:
+        in_it = is_elsewhere and "--namespace" not in command and command.startswith(_FOLLOWS_NAMESPACE)
+        return printable(f"{command} --namespace {shlex.quote(evidence.namespace)}" if in_it else command)
+
     for area, check in CHECKS.items():
         for note in check(evidence):
             texts: dict[str, Any] = {k: printable(value) for k, value in vars(note).items() if isinstance(value, str)}
             if not isinstance(note, Looked):
                 texts["commands"] = tuple(
-                    printable(_in_namespace(command, elsewhere))
-                    for command in note.commands
-                    if evidence.is_live or command.startswith(_OF_ANY_TIME)
+                    whole(command) for command in note.commands if evidence.is_live or command.startswith(_OF_ANY_TIME)
                 )
             notes.append(replace(note, **{**texts, "area": area}))
     return Examination(
@@ -61,10 +64,3 @@ def examine(evidence: Evidence) -> Examination:
         tuple(note for note in notes if isinstance(note, Looked)),
         tuple(note for note in notes if isinstance(note, NotLooked)),
     )
-
-
-def _in_namespace(command: str, elsewhere: str) -> str:
-    """Return a command that reaches the namespace that was examined, if it is not the default here."""
-    if not elsewhere or "--namespace" in command or not command.startswith(_FOLLOWS_NAMESPACE):
-        return command
-    return f"{command} --namespace {shlex.quote(elsewhere)}"

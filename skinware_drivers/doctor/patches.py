@@ -121,23 +121,17 @@ def _two_boards(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
         usual = max(of_period, min(enough.values()) if len(enough) > 1 else 0.0)
     for patch in driver.patches:
         count = enough.get(patch.name, 0.0)
-        if usual and count > _TWICE * usual and _collides(patch):
+        grown = patch.counted.grown
+        is_broken = grown.get("orphans", 0) > _BROKEN_SHARE * grown.get("updates", 0)
+        short_ns, long_ns = (patch.interval.quantile_ns(fraction) or 0 for fraction in (0.3, 0.9))
+        # a patch that only has a shorter period has whole updates at even intervals
+        if usual and count > _TWICE * usual and (is_broken or long_ns > 2 * short_ns + 1):
             span = age_text(evidence.seconds * 1e9)
             names = names_of_bus(patch.bus) | {"patch": patch.name, "times": f"{count / usual:.1f}"}
             if has_operation(driver.driver_type, "set_address"):
                 names["only"] = f"patch={patch.name}"
             seen = f"data of {count:.0f} updates of a module in {span}, {usual:.0f} are due"
             yield RULES["patch"]["two-boards"].found(_where(driver, patch), seen, **names)
-
-
-def _collides(patch: PatchSeen) -> bool:
-    """Return whether frames come as from two boards: they break each other's updates, or come at uneven intervals.
-
-    A patch that only has a shorter period than others does neither.
-    """
-    grown = patch.counted.grown
-    short_ns, long_ns = (patch.interval.quantile_ns(fraction) or 0 for fraction in (0.3, 0.9))
-    return grown.get("orphans", 0) > _BROKEN_SHARE * grown.get("updates", 0) or long_ns > 2 * short_ns + 1
 
 
 def _sent(driver: DriverSeen) -> dict[str, float]:

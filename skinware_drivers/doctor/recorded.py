@@ -77,17 +77,14 @@ def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> R
         is_whole=recording.is_whole,
         problems=tuple(recording.problems),
         services=tuple(name for name in recording.services if name not in recording.drivers),
-        missed=sum(_missed_in(event) for event in events),
+        missed=sum(
+            event["count"] for event in events if event.get("event") == "missed" and isinstance(event.get("count"), int)
+        ),
         events=Counter(str(event.get("event")) for event in events),
         clock_sets=tuple(clock_sets),
         boots=len({str(moment.get("boot")) for moment in clock}),
         recorded_by=recording.recorded_by,
     )
-
-
-def _missed_in(event: dict[str, Any]) -> int:
-    count = event.get("count")
-    return count if event.get("event") == "missed" and isinstance(count, int) else 0
 
 
 class _DriverTrack:
@@ -159,19 +156,15 @@ class _DriverTrack:
             scheduling="",
             restarts=self._restarts,
         )
-        missed = sum(_missed_in(event) for event in own)
-        return replace(seen, frames=self._frames, frames_missed=missed, buses=buses, patches=patches)
+        return replace(seen, frames=self._frames, buses=buses, patches=patches)
 
 
 def _continued(now: tuple[_PartT, ...], before: tuple[_PartT, ...]) -> tuple[_PartT, ...]:
     """Return buses or patches with the counters that they had under the same name before the structure changed."""
-    earlier = {part.name: part for part in before}
-    return tuple(_joined(part, earlier[part.name]) if part.name in earlier else part for part in now)
-
-
-def _joined(part: _PartT, earlier: _PartT) -> _PartT:
-    now: Counted = part.counted
-    before: Counted = earlier.counted
-    grown = dict(Counter(before.grown) + Counter(now.grown))
-    counted = Counted(now.total, grown)
-    return replace(part, counted=counted, changes=(*earlier.changes, *part.changes))
+    earlier, parts = {part.name: part for part in before}, []
+    for part in now:
+        if (old := earlier.get(part.name)) is not None:
+            counted = Counted(part.counted.total, dict(Counter(old.counted.grown) + Counter(part.counted.grown)))
+            part = replace(part, counted=counted, changes=(*old.changes, *part.changes))
+        parts.append(part)
+    return tuple(parts)

@@ -196,16 +196,12 @@ def _users(machine: Machine, paths: set[Path]) -> tuple[dict[Path, tuple[User, .
         except OSError:  # it ended meanwhile
             continue
         for path in paths:
-            if str(path) in targets and int(process.name) != os.getpid() and not _is_other_end(process, path):
+            # the maker of a pseudo terminal keeps it open for other programs
+            infos = (process / "fdinfo").glob("*") if path.parent.name == "pts" else ()
+            is_maker = any(f"tty-index:\t{path.name}" in text_of(info).splitlines() for info in infos)
+            if str(path) in targets and int(process.name) != os.getpid() and not is_maker:
                 found.setdefault(path, []).append(User(int(process.name), text_of(process / "comm")))
     return {path: tuple(users) for path, users in found.items()}, all_seen
-
-
-def _is_other_end(process: Path, path: Path) -> bool:
-    """Return whether a process made a pseudo terminal, which it keeps open for other programs."""
-    if path.parent.name != "pts":
-        return False
-    return any(f"tty-index:\t{path.name}" in text_of(info).splitlines() for info in (process / "fdinfo").glob("*"))
 
 
 def text_of(path: Path) -> str:

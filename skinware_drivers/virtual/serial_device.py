@@ -194,7 +194,10 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
         """Answer a question to this unit."""
-        asked = _read(command)
+        if _size_on_line(command) == len(command):
+            asked = _Asked(None, command[0], command[1:-2])
+        else:
+            asked = _Asked(command[:2], command[6], command[7:])
         if asked.unit != device.number:
             return None
         function = asked.message[0]
@@ -262,12 +265,6 @@ def _size_over_tcp(heard: bytes) -> int | None:
     if not _HEADER_OF_TCP + 6 <= size <= _HEADER_OF_TCP + 254:
         return None if len(heard) < 8 else 0  # possibly half a question of a line
     return size if len(heard) >= size else None
-
-
-def _read(command: bytes) -> _Asked:
-    if _size_on_line(command) == len(command):
-        return _Asked(None, command[0], command[1:-2])
-    return _Asked(command[:2], command[6], command[7:])
 
 
 def _reply(asked: _Asked, message: bytes) -> bytes:

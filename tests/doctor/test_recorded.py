@@ -64,7 +64,7 @@ def test_nothing_is_wrong_with_a_healthy_one(tmp_path: Path) -> None:
     nothing_found(run_and_look)
     evidence = kept[-1]
     (driver,) = evidence.drivers
-    assert (driver.name, driver.life, driver.restarts, driver.frames_missed) == ("torso", "live", 0, 0)
+    assert (driver.name, driver.life, driver.restarts) == ("torso", "live", 0)
     assert driver.frames >= 15
     assert driver.timing.rate_hz == pytest.approx(20, rel=0.5)
     told = examine(evidence)
@@ -179,10 +179,9 @@ def test_clocks_that_were_set_and_events_that_are_nonsense(tmp_path: Path, monke
     ]
     monkeypatch.setattr(Recording, "clock", property(lambda _: json.loads(json.dumps(clock))))
     monkeypatch.setattr(Recording, "events", property(lambda _: json.loads(json.dumps(events))))
-    evidence, findings = seen(file)
+    _, findings = seen(file)
     assert findings["the wall clock was set, or the machine slept"].evidence == "by +60.00 s"
     assert findings["the recorder missed samples"].evidence.startswith("3 samples ")
-    assert evidence.drivers[0].frames_missed == 3
     assert "a service could not be recorded" in findings
 
 

@@ -73,7 +73,7 @@ def guess(source: ColumnSource) -> str:
         f"version = {VERSION}",
     ]
     name = "" if len(chosen) > 1 else source.path.stem
-    found = [_driver(table, tables, times[table], _name(name or table)) for table in chosen]
+    found = [_driver(table, tables, times[table], name or table) for table in chosen]
     if not any(found):
         names = ", ".join(name for rows in tables.values() for name in rows) or "none"
         raise ConfigurationError(f"{source.path}: nothing looks like taxels; columns of numbers: {names}")
@@ -100,7 +100,7 @@ def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> l
     places = [name for name in names if name.lower() in ("x", "y", "z")]
     has_places = len(places) == 3 and rows[places[0]].ndim == 2
     wanted = [name for name in wanted if not (has_places and name in places)]
-    driver = driver or "imported"
+    driver = re.sub(r"[^a-z0-9]+", "-", driver.lower()).strip("-")[:32] or "imported"
     modules = list(_modules({name: rows[name] for name in wanted}, driver))
     if not modules:
         return []
@@ -260,10 +260,6 @@ def _type_of(name: str, axis: str) -> tuple[str, str, str]:
 
 def _label(text: str) -> str:
     return re.sub(r"[\W_]+", " ", text.replace("observation.", "")).strip()[:32]
-
-
-def _name(text: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:32]
 
 
 def _text(value: object) -> str:

@@ -199,7 +199,12 @@ class _Set:
             readers: dict[TimedTable, Frames] = {}
             for episode in self._episodes:
                 readers = {
-                    timed: readers.get(timed) or self._frames(episode, timed, self._windows[name])
+                    timed: readers.get(timed)
+                    or Frames(
+                        self._recordings.table(episode.recording, timed.name),
+                        timed.recorded_ns,
+                        self._windows[name] + self._reach,
+                    )
                     for name, timed in episode.piece.tables.items()
                 }
                 writer.add_episode(episode.task, len(episode), self._batches(episode, readers))
@@ -209,9 +214,6 @@ class _Set:
         self._write_beside(folder / "meta" / "skin")
         counts = {name: skin.interpolated for name, skin in self._skins.items() if self._reach}
         return [f"{name}: {count} of {sum(lengths)} rows are interpolated" for name, count in counts.items()]
-
-    def _frames(self, episode: Episode, timed: TimedTable, window: int) -> Frames:
-        return Frames(self._recordings.table(episode.recording, timed.name), timed.recorded_ns, window + self._reach)
 
     def _window(self, name: str) -> int:
         windows = {episode.piece.tables[name].window(self._wanted) for episode in self._episodes}

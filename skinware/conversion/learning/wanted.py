@@ -252,19 +252,17 @@ class Joined:
         if self._time == "time_ns":
             return self._on_axis(self._times.astype(np.int64), source)
         if self._time == "monotonic_ns":
-            return self._times.astype(np.int64) + self._ahead_ns(source)
+            ahead = [each["log_time_ns"] - each["monotonic_ns"] for each in source.clock if "monotonic_ns" in each]
+            if not ahead:
+                raise ConfigurationError(
+                    f"{source.path}: has no readings of clocks: {self.path} needs time_ns or unix_s"
+                )
+            return self._times.astype(np.int64) + int(ahead[0])
         if self._time == "unix_s":  # floats have it to a quarter of a microsecond
             since_ns = self._on_axis(np.rint(self._times * 1e6).astype(np.int64) * 1000, source)
         else:
             since_ns = source.start_ns + np.rint(self._times * NS_PER_S).astype(np.int64)
         return since_ns
-
-    def _ahead_ns(self, source: TableSource) -> int:
-        """Return the axis of the recording minus CLOCK_MONOTONIC."""
-        ahead = [each["log_time_ns"] - each["monotonic_ns"] for each in source.clock if "monotonic_ns" in each]
-        if not ahead:
-            raise ConfigurationError(f"{source.path}: has no readings of clocks: {self.path} needs time_ns or unix_s")
-        return int(ahead[0])
 
     def _on_axis(self, wall_ns: npt.NDArray[np.int64], source: TableSource) -> npt.NDArray[np.int64]:
         """Return times of the wall clock on the axis of the recording, (m,)."""

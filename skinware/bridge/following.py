@@ -140,12 +140,13 @@ class ServiceFollower:
         may_probe = time_ns > pulls.probe_until_ns and self.output.count is not None
         if may_probe and self._pacing.wants_probe(time_ns, clock.round_trip_ns):
             asked_ns = now_ns()
-            pulls.probe_until_ns = asked_ns + round(2 * ANSWER_S * NS_PER_S)
+            timeout_s = self._patience_for_frame_s
+            pulls.probe_until_ns = asked_ns + round(timeout_s * NS_PER_S)
             self._ask(
                 "newest",
                 lambda payload, returned_ns: self._probed(returned_ns - asked_ns, payload),
                 {"form": RAW},
-                timeout_s=2 * ANSWER_S,
+                timeout_s=timeout_s,
                 priority=Priority.PULLED,
             )
 
@@ -236,6 +237,10 @@ class ServiceFollower:
             if key == self._peer.keys.frame(self._name, self._part):  # not from a bridge that was followed before
                 self._take_frame(message)
 
+    @property
+    def _patience_for_frame_s(self) -> float:
+        return 2 * (ANSWER_S + self._peer.clock.round_trip_ns / NS_PER_S)
+
     def _pull_all(self, here: RecordedSample | None = None) -> None:
         while len(self._pulls.open) < self._pacing.open:
             self._pull(here)
@@ -243,7 +248,7 @@ class ServiceFollower:
     def _pull(self, here: RecordedSample | None = None) -> None:
         """Ask for a frame that is newer than all that came; ``here`` is one that is not published yet."""
         others = len(self._pulls.open)
-        timeout_s = 2 * (ANSWER_S + self._peer.clock.round_trip_ns / NS_PER_S)
+        timeout_s = self._patience_for_frame_s
         pull = self._pulls.begin(timeout_s)
         number, sequence = self.output.newest if here is None else max(self.output.newest, here.position)
         known = {"generation": number, "sequence": sequence, "base": self._decoder.sequence if self._decoder else 0}

@@ -14,7 +14,7 @@ from skinware.bridge.following import ServiceFollower
 from skinware.bridge.link import Link, Priority
 from skinware.bridge.messages import CallResult, Keys, Service, Services, Wish, read_text
 from skinware.bridge.mirror import Mirror
-from skinware.bridge.peer import ANSWER_S, Change, Jobs, Peer
+from skinware.bridge.peer import SLOWEST_ANSWER_S, Change, Jobs, Peer
 from skinware.bridge_state import BridgeState, BridgeStateWriter, ServiceState
 from skinware.errors import BridgeError, SkinwareError
 from skinware.memory.namespace import Namespace
@@ -168,7 +168,7 @@ class Joiner:
         self._peer.ask(
             self._services_key,
             lambda payload, _: self._take_services(payload),
-            timeout_s=ANSWER_S,
+            timeout_s=SLOWEST_ANSWER_S,
             priority=Priority.CALLS,
             payload=b"" if self._wish is None else msgspec.json.encode(self._wish),
         )

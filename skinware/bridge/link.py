@@ -15,8 +15,10 @@ import zenoh
 from skinware.bridge.endpoints import Endpoints
 from skinware.errors import BridgeError, SkinwareError
 
-LEASE_MS = 2000
-"""A peer that is silent for this long is gone."""
+_LEASE_MS, _SIGNS_OF_LIFE = 5000, 10
+"""A session without a byte for this long is over; how often a session shows in that time that it lives. The first sign
+comes a round trip and such a pause after the session began: a link may have a round trip of 4 s.
+"""
 _RETRY_MS = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 2}
 _FOREVER_MS = -1
 _BATCHES = 4
@@ -62,7 +64,8 @@ def open_session(endpoints: Endpoints) -> zenoh.Session:
         "scouting/gossip/enabled": "false",
         "transport/shared_memory/enabled": "false",
         "transport/link/rx/max_message_size": str(_LONGEST_MESSAGE),
-        "transport/link/tx/lease": str(LEASE_MS),
+        "transport/link/tx/lease": str(_LEASE_MS),
+        "transport/link/tx/keep_alive": str(_SIGNS_OF_LIFE),
         "transport/link/tx/queue/size/data": str(_BATCHES),
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": str(_PATIENCE_US),
         "adminspace/enabled": "false",

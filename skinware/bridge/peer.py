@@ -21,14 +21,15 @@ Change = Literal["appeared", "moved", "restarted", "lost", "clock"]
 """A bridge serves the robot now; another bridge does, with other keys; its clock and generations are others than
 before; it is not heard any more; its clock was measured again."""
 
-ANSWER_S = 1.0
+ANSWER_S, SLOWEST_ANSWER_S = 1.0, 5.0
+"""Longest wait for an answer besides a round trip, and while no round trip is known."""
 _MOST_JOBS, _MOST_BYTES = 4096, 1 << 27
 _PATIENCE_NS, _NEVER_NS = 3 * NS_PER_S, 1 << 62
 """How long a robot is not reached before the reason is looked for, and before it is looked for again."""
 _PING_NS = 150_000_000
 _SILENCE_NS = 400_000_000
 """Silence that ends a connection; on a long link the round trips of a ping come on top."""
-_ROUND_TRIPS, _LONGEST_ROUND_TRIP_NS = 2, NS_PER_S
+_ROUND_TRIPS, _LONGEST_ROUND_TRIP_NS = 2, 2 * NS_PER_S
 """Round trips of a ping, one of them for a packet that got lost."""
 _MOST_TROUBLE, _MOST_BRIDGES = 256, 256
 
@@ -211,7 +212,7 @@ class Peer:
         elif silent_ns > _SILENCE_NS - _PING_NS:
             round_trip_ns = self.clock.recent_round_trip_ns if self.clock.is_known else _LONGEST_ROUND_TRIP_NS
             if silent_ns > _SILENCE_NS + _ROUND_TRIPS * round_trip_ns:
-                self._lose("nothing comes over the link")
+                self._lose(_silence_text(silent_ns))
             elif time_ns - self._pinger.asked_ns > _PING_NS:
                 self._pinger.ask()
 
@@ -248,7 +249,9 @@ class Peer:
         elif there:
             self._changed("appeared")
         elif instance == bridges.instance:
-            self._lose("its bridge ended")
+            silent_ns = now_ns() - self._heard_ns
+            ended = "its bridge ended, or the connection was closed"
+            self._lose(_silence_text(silent_ns) if silent_ns > _SILENCE_NS else ended)
 
     def _lose(self, why: str) -> None:
         if self.is_connected:
@@ -276,6 +279,10 @@ class Peer:
             self._changed("clock")
 
         self.soon("a clock", take)
+
+
+def _silence_text(silent_ns: int) -> str:
+    return f"no answer for {silent_ns / NS_PER_S:.1f} s"
 
 
 def _named(instance: str, host: str) -> str:

@@ -1,8 +1,9 @@
-"""A link that is slow: a TCP connection through which only so many bits a second go."""
+"""A link that is slow: a TCP connection through which only so many bits a second go, each after a delay."""
 
 from __future__ import annotations
 
 import contextlib
+import queue
 import socket
 import threading
 import time
@@ -23,8 +24,8 @@ class SlowLink:
         flows: where it is cleared, nothing goes through, and all waits.
     """
 
-    def __init__(self, to_port: int, bits_per_s: float) -> None:
-        self.bits_per_s = bits_per_s
+    def __init__(self, to_port: int, bits_per_s: float, delay_s: float) -> None:
+        self.bits_per_s, self._delay_s = bits_per_s, delay_s
         self.flows = threading.Event()
         self.flows.set()
         self._to_port = to_port
@@ -79,11 +80,28 @@ class SlowLink:
 
     def _pump(self, source: socket.socket, target: socket.socket) -> None:
         due_s = time.monotonic()
+        on_its_way: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
+        self._start(self._deliver, on_its_way, source, target)
+        data = b"-"
+        while data:
+            try:
+                data = source.recv(_PIECE)
+            except OSError:
+                data = b""
+            due_s = max(due_s, time.monotonic()) + 8 * len(data) / self.bits_per_s
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            on_its_way.put((time.monotonic() + self._delay_s, data))
+
+    def _deliver(
+        self, on_its_way: queue.SimpleQueue[tuple[float, bytes]], source: socket.socket, target: socket.socket
+    ) -> None:
         with contextlib.suppress(OSError):
-            while data := source.recv(_PIECE):
-                due_s = max(due_s, time.monotonic()) + 8 * len(data) / self.bits_per_s
+            while True:
+                due_s, data = on_its_way.get()
                 time.sleep(max(0.0, due_s - time.monotonic()))
                 self.flows.wait()
+                if not data:
+                    break
                 target.sendall(data)
         for connection in (source, target):
             with contextlib.suppress(OSError):
@@ -91,8 +109,8 @@ class SlowLink:
 
 
 @contextmanager
-def slow_link(to_port: int, bits_per_s: float) -> Iterator[SlowLink]:
-    link = SlowLink(to_port, bits_per_s)
+def slow_link(to_port: int, bits_per_s: float, delay_s: float = 0.0) -> Iterator[SlowLink]:
+    link = SlowLink(to_port, bits_per_s, delay_s)
     try:
         yield link
     finally:

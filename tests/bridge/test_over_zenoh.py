@@ -152,6 +152,17 @@ def test_a_slow_link_has_the_newest_and_a_fast_one_has_all(namespace: Namespace,
     shutil.rmtree(beside.path, ignore_errors=True)
 
 
+@pytest.mark.thorough
+def test_a_link_with_a_long_delay_passes_all_frames(namespace: Namespace, here: Namespace) -> None:
+    port = free_port()
+    with driver(namespace, 64, 20), serving(port), slow_link(port, 1e9, 0.8) as slow, joining(slow.port, here) as join:
+        status(join, lambda arm: arm["rate_hz"] > 15)
+        slow.flows.clear()
+        lost = join.wait_for("disconnected")
+        assert "no answer for " in lost["why"]
+        slow.flows.set()
+
+
 def certificates(authority: trustme.CA, folder: Path, name: str) -> str:
     """A folder with a certificate of an authority."""
     made = authority.issue_cert("127.0.0.1", common_name=name)

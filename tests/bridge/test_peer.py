@@ -38,4 +38,5 @@ def test_a_robot_behind_a_delay_that_has_grown_stays_connected() -> None:
     peer.look(now_ns() + 1700 * MS)
     assert not peer.is_connected
     assert [event["event"] for event in events] == ["connected", "disconnected"]
+    assert "no answer for 1." in events[1]["why"]
     jobs.close()

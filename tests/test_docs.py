@@ -27,7 +27,7 @@ from skinware.tactile.curves import read_curves
 from skinware.tactile.regions import read_regions
 from skinware.tactile.testing import read_stage
 from skinware.views.robot import read_robot
-from skinware_drivers.cli.driver_file import ConfigFile
+from skinware_drivers.cli.driver_setup import ConfigFile
 from skinware_drivers.registry import DEFAULT_DRIVER, DRIVERS, load_driver
 from skinware_drivers.streams.ros2_map import read_map
 from skinware_drivers.virtual.physics.binding import SCENES, find_binding

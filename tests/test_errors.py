@@ -28,7 +28,7 @@ from skinware.memory.ring import slot_headers_of
 from skinware.realtime import Profile
 from skinware.recording import open as open_recording
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.cli.driver_file import ConfigFile
+from skinware_drivers.cli.driver_setup import ConfigFile
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.fields import Match
 from skinware_drivers.link import Link

@@ -174,7 +174,7 @@ def _without_driver(
 def _adapter(
     bus_name: str, driver_name: str | None, options: tuple[str, ...], config: Path | None
 ) -> tuple[str, AnyAdapter]:
-    from skinware_drivers.cli.driver_file import ConfigFile
+    from skinware_drivers.cli.driver_setup import ConfigFile
     from skinware_drivers.registry import DEFAULT_DRIVER, NamedBus, load_driver
 
     file = ConfigFile(config)

@@ -39,7 +39,7 @@ _UNIT_PROGRAM = "/opt/skinware/bin/skin-driver"
 
 def _options_of(given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
     from skinware_drivers.cli.capturing import driver_of_recording
-    from skinware_drivers.cli.driver_file import ConfigFile
+    from skinware_drivers.cli.driver_setup import ConfigFile
     from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 

@@ -14,7 +14,7 @@ import pytest
 from skinware import DriverReader
 from skinware.cli._command import exit_status
 from skinware_drivers.cli import config, driver, emulate, find
-from skinware_drivers.cli.driver_file import ConfigFile
+from skinware_drivers.cli.driver_setup import ConfigFile
 from skinware_drivers.registry import load_driver
 from skinware_drivers.virtual.hardware import load_emulator
 from tests.commands import running

@@ -7,7 +7,7 @@ from tempfile import NamedTemporaryFile
 
 import pytest
 
-from skinware_drivers.cli.driver_file import ConfigFile
+from skinware_drivers.cli.driver_setup import ConfigFile
 from skinware_drivers.icub.importer import Import, import_files
 from skinware_drivers.icub.xml_tree import Note, Notes
 

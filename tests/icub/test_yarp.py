@@ -12,7 +12,7 @@ from skinware import DriverReader
 from skinware.cli._command import exit_status
 from skinware.geometry import read_geometry
 from skinware.tactile.regions import read_regions
-from skinware_drivers.cli.driver_file import ConfigFile
+from skinware_drivers.cli.driver_setup import ConfigFile
 from skinware_drivers.cli.import_ import command
 from skinware_drivers.streams.yarp import Triangles, YarpOptions
 from tests.commands import running

@@ -9,7 +9,7 @@ import pytest
 from skinware.errors import ConfigurationError
 from skinware.toml_text import Keys, TomlText, line_of
 from skinware_drivers.can.roboskin_layout import RoboskinOptions
-from skinware_drivers.cli.driver_file import ConfigFile
+from skinware_drivers.cli.driver_setup import ConfigFile
 
 TEXT = """\
 driver = "roboskin"

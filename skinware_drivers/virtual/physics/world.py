@@ -4,16 +4,139 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
-from skinware.realtime import NS_PER_S
+from skinware.memory.schema import Column
+from skinware.realtime import NS_PER_S, now_ns
+from skinware.service import ServiceWriter
 from skinware_drivers.virtual.physics.binding import Bound
 from skinware_drivers.virtual.physics.body import PhysicsScene
-from skinware_drivers.virtual.physics.services import WorldServices
 from skinware_drivers.virtual.physics.transfer import Transfer
+
+TRUTH, JOINTS = "truth", "joints"
+RATE_HZ = 100
+_MOST = 32
+_LONGEST_NAME = 64
+
+
+class WorldServices:
+    """Publish what is true in a scene and where its joints are, 100 times a second, and take commands.
+
+    Raises:
+        NameInUse: another world publishes here.
+    """
+
+    def __init__(self, scene: PhysicsScene) -> None:
+        self._scene = scene
+        self._due_ns = 0
+        n, joints, actuators = len(scene.modules), len(scene.joints), len(scene.actuators.names)
+
+        def floats(shape: tuple[int, ...], unit: str, description: str) -> Column:
+            return Column(np.dtype("<f8"), shape, unit, description)
+
+        self._truth = ServiceWriter(
+            TRUTH,
+            {
+                "count": Column(np.dtype("<u4"), (1,), "", "number of contacts; later rows are old"),
+                "point_m": floats((_MOST, 3), "m", "of each contact, in the frame of its module's body"),
+                "normal_n": floats((_MOST,), "N", "of each"),
+                "shear_n": floats((_MOST, 3), "N", "of each, on the module"),
+                "slip_m_s": floats((_MOST,), "m/s", "speed of the other body along the surface"),
+                "module": Column(np.dtype("<u4"), (_MOST,), "", "of each, a row of module_name"),
+                "module_n": floats((n,), "N", "normal force on each module"),
+                "force_n": floats((1,), "N", "normal force on all modules"),
+                "touched_s": floats((1,), "s", "time of the scene when the present touch began; NaN: none"),
+                "scene_s": floats((1,), "s", "time of the scene"),
+                "lag_s": floats((1,), "s", "by which the physics is behind"),
+            },
+            {"module_name": _texts([module.name for module in scene.modules])},
+            rate_hz=RATE_HZ,
+            description="contacts of a simulated scene",
+        )
+        self._joints = ServiceWriter(
+            JOINTS,
+            {
+                "position": floats((max(1, joints),), "", "of each joint, rad or m"),
+                "velocity": floats((max(1, joints),), "", "of each joint, rad/s or m/s"),
+                "target": floats((max(1, actuators),), "", "of each actuator"),
+                "commanded_s": floats((1,), "s", "time of the scene at the newest command; NaN: none yet"),
+            },
+            {
+                "joint_name": _texts(scene.joints),
+                "actuator_name": _texts(scene.actuators.names),
+                "pose_name": _texts(list(scene.actuators.poses)),
+            },
+            rate_hz=RATE_HZ,
+            description="joints of a simulated scene",
+            operations={"move": self.move, "hold": self.hold},
+        )
+        addresses = zip(scene.model.jnt_qposadr, scene.model.jnt_dofadr, strict=True)
+        self._joint_rows = [(int(position), int(velocity)) for position, velocity in addresses]
+
+    def serve(self, time_ns: int) -> None:
+        """Carry out commands, and publish what is due.
+
+        Args:
+            time_ns: of the physics, CLOCK_MONOTONIC ns.
+        """
+        waiting = [*self._truth.answer_requests(), *self._joints.answer_requests()]
+        if waiting or time_ns >= self._due_ns:
+            self._publish(time_ns)
+            self._due_ns = time_ns + NS_PER_S // RATE_HZ
+        for request in waiting:
+            request.reply(position=self._truth.position)
+
+    def move(self, pose: str = "", targets: dict[str, float] | None = None, seconds: float = 0.0) -> None:
+        """Move to a pose, or actuators to targets, within a time.
+
+        Raises:
+            ValueError: there is no such pose.
+            ConfigurationError: there is no such actuator, or a number is none.
+        """
+        if pose and pose not in self._scene.actuators.poses:
+            raise ValueError(f"there is no pose {pose!r}; there are {', '.join(self._scene.actuators.poses)}")
+        self._scene.actuators.commanded_s = self._scene.time_s
+        self._scene.actuators.move({**(self._scene.actuators.poses[pose] if pose else {}), **(targets or {})}, seconds)
+
+    def hold(self) -> None:
+        """Stop every movement: actuators keep the targets that they have now."""
+        self._scene.actuators.commanded_s = self._scene.time_s
+        self._scene.actuators.hold()
+
+    def close(self) -> None:
+        """Take the services away. Idempotent."""
+        self._truth.close()
+        self._joints.close()
+
+    def _publish(self, time_ns: int) -> None:
+        scene = self._scene
+        touches = scene.touching()
+        columns = self._truth.begin(from_last=True)
+        modules, newtons = [touch.module for touch in touches], [touch.normal_n for touch in touches]
+        columns["module_n"][:] = np.bincount(modules, newtons, len(scene.modules))
+        columns["force_n"][0] = columns["module_n"].sum()
+        for name in ("point_m", "normal_n", "shear_n", "slip_m_s", "module") if touches else ():
+            columns[name][: len(touches)] = [getattr(touch, name) for touch in touches[:_MOST]]
+        columns["count"][0] = min(len(touches), _MOST)
+        columns["touched_s"][0], columns["scene_s"][0] = scene.touched_s, scene.time_s
+        columns["lag_s"][0] = (now_ns() - time_ns) / NS_PER_S
+        self._truth.commit(time_ns)
+        columns = self._joints.begin(from_last=True)
+        for row, (position, velocity) in enumerate(self._joint_rows):
+            columns["position"][row] = scene.data.qpos[position]
+            columns["velocity"][row] = scene.data.qvel[velocity]
+        columns["target"][: len(scene.actuators.names)] = scene.data.ctrl
+        columns["commanded_s"][0] = scene.actuators.commanded_s
+        self._joints.commit(time_ns)
+
+
+def _texts(names: list[str]) -> Any:
+    return np.array([name.encode()[:_LONGEST_NAME] for name in names] or [b""], f"|S{_LONGEST_NAME}")
+
 
 ArrayF = npt.NDArray[np.float64]
 

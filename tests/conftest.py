@@ -42,8 +42,9 @@ LONG = (
 )
 """Tests of the suite that a push leaves out for the other drivers."""
 
-# what a shell runs in the background ignores Ctrl-C, and so would all that the tests start and interrupt
+# what a shell runs in the background ignores Ctrl-C, what nohup runs a hangup, and so would all that the tests start
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -9,13 +9,17 @@ from typing import Any
 import pytest
 
 from skinware.cli._command import exit_status
+from skinware_drivers.can import roboskin_setup
 from skinware_drivers.cli.config import command
 from tests.commands import running
 
 pytestmark = [pytest.mark.can, pytest.mark.timeout(300)]
 
 
-def test_a_board_gets_another_address(vcan: Callable[[], str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_board_gets_another_address(
+    vcan: Callable[[], str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(roboskin_setup, "_REPLY_S", 5.0)  # a starved emulator answers, too
     name = vcan()
 
     def configured(*arguments: str) -> Any:

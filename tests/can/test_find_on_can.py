@@ -11,6 +11,7 @@ import pytest
 
 from skinware.cli._command import exit_status
 from skinware_drivers.cli.find import command, look
+from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 from tests.commands import running
 
@@ -24,10 +25,16 @@ def interface(found: dict[str, Any], name: str) -> dict[str, Any]:
 
 def test_emulated_boards_on_vcan_are_heard_and_asked(vcan: Callable[[], str]) -> None:
     name = vcan()
+    one: dict[str, Any] = {}
+
+    def is_whole() -> bool:
+        one.update(interface(asyncio.run(look((name,), 2.0, probe=True)), name))
+        found = [*(patch for guess in one["heard"].guesses for patch in guess.patches), *one["probe"].answers]
+        return {"board 7", "board 8", "roboskin"} <= set(found)
+
     with running("skin-emulate", "--bus", name, "--boards", "7,8", "--streaming") as emulator:
         emulator.wait_for("ready")
-        found = asyncio.run(look((name,), 2.0, probe=True))
-    one = interface(found, name)
+        wait_until(is_whole, 120)  # a starved emulator is not heard, or answers too late
     assert (one["kind"], one["up"], one["bit_rate"], one["state"], one["advice"]) == ("vcan", True, None, "", [])
     assert [(guess.driver, guess.patches) for guess in one["heard"].guesses] == [("roboskin", ("board 7", "board 8"))]
     assert one["heard"].load is None  # a virtual interface has no bit rate

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
-
 from docutils import nodes
 from docutils.statemachine import StringList
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
+
+from skinware_drivers.cli import skin
 
 
 class Commands(SphinxDirective):
@@ -15,9 +15,8 @@ class Commands(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         lines = []
-        for entry in entry_points(group="console_scripts"):
-            if entry.name.startswith("skin-"):
-                lines += [f"```{{click}} {entry.module}:command", f":prog: {entry.name}", ":nested: full", "```", ""]
+        for name, tool in skin.COMMANDS.items():
+            lines += [f"```{{click}} {tool.module}:command", f":prog: skin-{name}", ":nested: full", "```", ""]
         found = nodes.container()
         self.state.nested_parse(StringList(lines, source=self.get_source_info()[0]), self.content_offset, found)
         return found.children

@@ -14,15 +14,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import IO, Any
 
 import click
 
 from skinware.cli._command import exit_status
+from skinware_drivers.cli import skin
 
-COMMANDS = {entry.name: entry for entry in entry_points(group="console_scripts") if entry.name.startswith("skin-")}
+COMMANDS = {f"skin-{name}": tool.module for name, tool in skin.COMMANDS.items()}
 BIN = Path(sys.executable).parent
 PATIENCE_S = 120.0
 """How long a command may take for its next line: the CAN lab's processor is emulated."""
@@ -41,7 +41,7 @@ def parse(command: str, *arguments: str) -> None:
     Raises:
         click.UsageError: it does not take them.
     """
-    module = import_module(COMMANDS[command].module)
+    module = import_module(COMMANDS[command])
     with suppress(click.exceptions.Exit):  # --help and the like
         _parse(vars(module).get("command") or module.emulate, command, list(arguments), None)
 
@@ -59,10 +59,9 @@ def refused(command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
     Its exit status and output are those of ``run``. An exception that it does not expect is raised here.
     """
-    (entry,) = entry_points(group="console_scripts", name=command)
     out, errors = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(errors):
-        status = exit_status(import_module(entry.module).command, arguments)
+        status = exit_status(import_module(COMMANDS[command]).command, arguments)
     return subprocess.CompletedProcess([command, *arguments], status, out.getvalue(), errors.getvalue())
 
 

@@ -32,7 +32,7 @@ def _build_into(folder: Path) -> None:
 def copy_sources(folder: Path) -> None:
     """All that a wheel is built from, into a new folder."""
     folder.mkdir()
-    for part in ("skinware", "skinware_drivers"):
+    for part in ("skinware", "skinware_drivers", "skinware_start"):
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__", "*.so"))
     for part in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / part, folder)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from importlib.metadata import entry_points, version
+from importlib.metadata import version
 from pathlib import Path
 
 import click
@@ -14,9 +14,7 @@ from skinware import Namespace
 from skinware.cli._command import EXIT_FAILED, EXIT_USAGE, exit_status
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin
-from tests.commands import refused, running
-
-COMMANDS = {e.name: e.module for e in entry_points(group="console_scripts") if e.name.startswith("skin-")}
+from tests.commands import COMMANDS, refused, running
 
 
 def command_of(name: str) -> click.Command:

@@ -19,8 +19,8 @@ PROJECT = Path(__file__).parents[2]
 
 def test_every_installed_command_is_listed_with_its_module() -> None:
     scripts = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]["scripts"]
-    assert scripts.pop("skin") == "skinware_drivers.cli.skin:main"
-    assert {f"skin-{name}": f"{entry.module}:main" for name, entry in skin.COMMANDS.items()} == scripts
+    assert scripts.pop("skin") == "skinware_start:skinware_drivers.cli.skin.main"
+    assert {f"skin-{name}": f"skinware_start:{entry.module}.main" for name, entry in skin.COMMANDS.items()} == scripts
 
 
 def test_alone_it_lists_them_in_groups_with_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,33 @@
+"""Ctrl-C while the modules of a command are imported."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+_INTERRUPT = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+
+
+@pytest.mark.parametrize(
+    ("module", "status", "printed"),
+    [
+        (f"{_INTERRUPT}\n", 130, ""),
+        ("def main():\n    print('runs')\n", 0, "runs\n"),
+        (
+            f"def main():\n    try:\n        {_INTERRUPT}\n    except KeyboardInterrupt:\n        print('noticed')\n",
+            0,
+            "noticed\n",
+        ),
+    ],
+    ids=["during the import", "never", "after the import"],
+)
+def test_ctrl_c_before_a_command_runs_ends_it_in_silence(
+    module: str, status: int, printed: str, tmp_path: Path
+) -> None:
+    (tmp_path / "interrupted.py").write_text(module)
+    program = "import skinware_start; skinware_start._Function('interrupted.main')()"
+    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (status, printed, "")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
+import resource
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,6 +29,8 @@ _PATIENCE_US = 1000
 """How long a frame may wait for a slow receiver before that receiver misses it."""
 _LONGEST_MESSAGE = 1 << 26
 """Bytes to which the fragments of a message may add up."""
+_FILES = 24
+"""Files that a session and the services of a bridge need; zenoh panics where it cannot open one."""
 _OS_ERROR = re.compile(r"([A-Z][\w ]+) \(os error \d+\)")
 
 
@@ -52,6 +56,9 @@ class Priority:
 
 def open_session(endpoints: Endpoints) -> zenoh.Session:
     """Open a session that shares only what it declares, and that always connects again."""
+    most, n_open = resource.getrlimit(resource.RLIMIT_NOFILE)[0], len(os.listdir("/proc/self/fd"))
+    if resource.RLIM_INFINITY != most < n_open + _FILES:
+        raise BridgeError(f"a bridge needs {_FILES} files beside {n_open}, and may open {most}: raise `ulimit -n`")
     settings: dict[str, object] = {
         "mode": json.dumps(endpoints.mode),
         "connect/endpoints": json.dumps(endpoints.connect),

@@ -110,12 +110,17 @@ class PatientStream(io.TextIOBase):
             os.close(fd)
 
     def _write(self, data: bytes) -> int:
-        if self._own_fd is not None:
-            try:
+        """Return how much was written; the terminal may be closed, and then SIGHUP ends the command in good order."""
+        try:
+            if self._own_fd is not None:
                 return os.write(self._own_fd, data)
-            except BlockingIOError:
-                return 0
-        return os.write(self._fd, data[:_SLICE]) if self._until_writable(0) else 0
+            return os.write(self._fd, data[:_SLICE]) if self._until_writable(0) else 0
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            return len(data)
 
     def _until_writable(self, timeout_s: float) -> bool:
         poll = select.poll()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import random
+import resource
 import shutil
 import socket
 import zlib
@@ -284,6 +285,13 @@ def test_commands_that_cannot_be_carried_out_say_why_in_a_line(
 
 
 @pytest.mark.thorough
+def test_too_few_files_are_an_error_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (10, 10))
+    ended = refused("skin-bridge", "serve", "--robot", ROBOT, "--listen", "tcp/127.0.0.1:0")
+    assert ended.returncode == 1
+    assert "may open 10: raise `ulimit -n`" in ended.stderr
+
+
 def test_a_port_that_is_in_use_is_told_in_a_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -168,3 +168,12 @@ def test_streams_that_have_no_file_stay_as_they_are(capsys: pytest.CaptureFixtur
     with patient_output():
         print("as ever")
     assert capsys.readouterr().out == "as ever\n"
+
+
+def test_a_terminal_that_is_gone_takes_all_lines() -> None:
+    controller, terminal = pty.openpty()
+    with open(terminal, "w", encoding="utf-8") as shown:
+        patient = PatientStream(shown)
+        os.close(controller)
+        assert patient.write("a line\n") == 7
+        patient.end()

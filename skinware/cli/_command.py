@@ -69,7 +69,6 @@ def command(
 
 
 def group(name: str) -> Callable[[Callable[..., Any]], click.Group]:
-    """Make a group of commands of a function, with ``-h`` and ``--version``."""
     made = click.group(name, context_settings=CONTEXT_SETTINGS)
     return lambda function: version_option(made(function))
 

@@ -108,8 +108,6 @@ _WIDTH = 100
 
 @dataclass(frozen=True)
 class GatheringOptions:
-    """The options of all commands that gather."""
-
     driver: str | None
     type_name: str | None
     share: float
@@ -121,8 +119,6 @@ class GatheringOptions:
 
 
 class Gathering:
-    """Take the snapshots of a driver into a session, and report the progress."""
-
     def __init__(
         self,
         reader: DriverReader,
@@ -259,7 +255,6 @@ def opened(
     how: GatheringOptions,
     poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
 ) -> Iterator[tuple[Gathering, Any]]:
-    """Yield a gathering, with driver and poses open, and its session."""
     with ExitStack() as stack:
         reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))
         source = LoadSource(reader.structure, reader.driver_type, how.type_name)

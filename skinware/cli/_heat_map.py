@@ -66,7 +66,6 @@ def levels_of(
 
 
 def codes_of(levels: npt.NDArray[np.uint8], marks: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    """Return (n,) uint8, the codes of sensors with these levels and marks."""
     return marks * np.uint8(LEVELS) + np.where(marks < FIRST_WITHOUT_VALUE, levels, np.uint8(0))
 
 

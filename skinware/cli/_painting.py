@@ -302,13 +302,10 @@ class TextLines(ScrollView, can_focus=False):
 
     @property
     def ground(self) -> Style:
-        """The colours where nothing is drawn."""
         return Style.null() if self.app.no_color else _GROUND_STYLE
 
 
 class HeatMap(TextLines):
-    """A picture in the colours of a palette."""
-
     class Pointed(Message):
         """The mouse points at a sensor (its position in a snapshot), or at none."""
 

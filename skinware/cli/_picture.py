@@ -138,7 +138,6 @@ class Picture:
         return inside
 
     def _arrange(self, key: RowKey, structure: Structure, type_name: str, width: int, height: int) -> Arrangement:
-        """Place the sensors, and write the title."""
         patches, region = patches_of(key, structure), self._region
         smallest = 2 if self._palette.characters else 1
         only = None if region is None else self._in_regions(key.driver, structure, type_name)[region]

@@ -59,7 +59,6 @@ def report(namespace: Namespace, only: str | None = None) -> dict[str, Any]:
 
 
 def sensors(namespace: Namespace, driver: str) -> list[dict[str, Any]]:
-    """Return every sensor of a driver in the order of its snapshots."""
     with DriverReader(driver, namespace=namespace, announce=False) as reader:
         structure = reader.structure
     names = {sensor_type.id: sensor_type.name for sensor_type in structure.types}
@@ -219,7 +218,6 @@ _FAULT_COLOUR = "yellow"
 
 
 def show(namespaces: Sequence[Namespace], driver: str | None, as_json: bool) -> None:
-    """Print the health of all sensors that services publish, or of those of one driver."""
     entries: list[dict[str, Any]] = []
     problems: list[str] = []
     for namespace in namespaces:

@@ -202,7 +202,6 @@ def overwrite(text: str, *, err: bool = False) -> None:
 
 
 def are_terminals(*streams: TextIO | None) -> bool:
-    """Return whether all these streams are open and on a terminal."""
     return all(stream is not None and stream.isatty() for stream in streams)
 
 
@@ -228,7 +227,6 @@ def print_json(data: object) -> None:
 
 
 def say(as_json: bool, data: object, text: str) -> None:
-    """Print one object for programs, or else one text for people."""
     if as_json:
         print_json(data)
     else:
@@ -244,7 +242,5 @@ def json_text(data: object) -> str:
 
 
 class Formatter(logging.Formatter):
-    """Format lines of the log for a terminal."""
-
     def format(self, record: logging.LogRecord) -> str:
         return shown(super().format(record))

@@ -138,8 +138,6 @@ class _Bell:
 
 
 class SkinTop(App[None]):
-    """Show drivers, buses and patches, and a picture of the sensors under the cursor."""
-
     TITLE = "skin-top"
     ENABLE_COMMAND_PALETTE = False
     CSS = """
@@ -308,7 +306,6 @@ class SkinTop(App[None]):
         return self._overview.drivers.get(row.key.driver)
 
     def _say(self, where: str, text: str | Text) -> None:
-        """Show a text, which may come from others, in a line of the screen."""
         line = self._lines[where]
         if isinstance(text, str):
             text = printable(text, "\n")
@@ -381,7 +378,6 @@ class SkinTop(App[None]):
             self._say("detail", counters_text(row.counters))
 
     def _show_contacts(self, driver: LiveDriver) -> None:
-        """Show the picture with the contacts over it, and a line for each contact."""
         contacts, panel = self._overview.contacts_on(driver), self._lines["contacts"]
         panel.display = contacts is not None and self.size.height >= _LOW
         places = contacts or []

@@ -56,7 +56,6 @@ class DriverList(TextLines):
         return self.rows[self.cursor] if self.cursor < len(self.rows) else None
 
     def show(self, rows: list[ListRow]) -> None:
-        """Draw the rows that changed."""
         before, self.rows = self.rows, rows
         keys = [row.key for row in rows]
         at = keys.index(self._wanted) if self._wanted in keys else 0

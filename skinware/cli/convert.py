@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 
 def _window(text: str) -> int:
-    """Return a number of frames; 0: all."""
     if text == "all":
         return 0
     if not text.isdecimal() or not int(text):
@@ -31,7 +30,6 @@ def _window(text: str) -> int:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Return height and width of an image."""
     width, _, height = text.partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise click.BadParameter(f"{text!r} is not WIDTHxHEIGHT, as in 96x48.")

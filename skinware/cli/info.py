@@ -201,7 +201,6 @@ def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _content_lines(service: dict[str, Any]) -> list[str]:
-    """Return the state of a bridge, or the columns of another service."""
     if service.get("bridge") is not None:
         return [*as_lines(service["bridge"]["robot"], service["bridge"]), ""]
     rows = [
@@ -224,7 +223,6 @@ def _dtype_text(descr: Any) -> str:
 
 
 def _statistics_lines(entry: dict[str, Any]) -> list[str]:
-    """Return the times of a writer, once it has published anything."""
     statistics = entry["statistics"]
     wall, cpu = statistics["wall"], statistics["cpu"]
     if not wall["count"]:

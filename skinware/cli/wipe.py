@@ -109,7 +109,6 @@ class _Wipe:
                 return
 
     def report_result(self) -> bool:
-        """List the sensors that never answered, and return whether all did."""
         tested, never = self._count()
         answered = tested - len(never)
         named = [

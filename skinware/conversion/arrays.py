@@ -17,7 +17,6 @@ FORMAT, VERSION = "skinware-arrays", 1
 
 
 def description(source: TableSource, units: Sequence[dict[str, str]]) -> bytes:
-    """Return the JSON text in a file of arrays: its format, tables, units, events and clocks."""
     tables = [
         {"name": table.name, "service": table.service, "units": of}
         for table, of in zip(source.tables, units, strict=True)

@@ -165,8 +165,6 @@ def begun_beside(target: Path) -> Iterator[Path]:
 
 
 class WireFormat(NamedTuple):
-    """A format of recorded wires: the suffix of its files, and the function that writes one."""
-
     suffix: str
     export: Callable[[Recording, Path, Chosen], Exported]
 

@@ -35,8 +35,6 @@ _COLOURS = np.concatenate([_COLOURS, np.tile(_NO_VALUE, (5, 1))]).astype(np.uint
 
 
 class Sink(Protocol):
-    """Something that shows drivers."""
-
     def arrange(self, scene: Scene, drivers: Collection[ShownDriver]) -> None:
         """Take the places of all taxels, whenever drivers or structures change."""
 

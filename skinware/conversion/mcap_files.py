@@ -218,7 +218,6 @@ class _MessageWriter:
             self._file.finish()
 
     def metadata(self, name: str) -> str:
-        """Return the text of rosbag2's metadata.yaml for a file of this name."""
         topics = []
         for channel, (topic, type_name) in self._types.items():
             topics += [

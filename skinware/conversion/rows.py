@@ -57,7 +57,6 @@ class Leaf(NamedTuple):
 
 
 def leaves(each: ArrayFormat) -> list[Leaf]:
-    """Return the leaves of an array that hold numbers."""
     found = [Leaf((), each.shape, each.dtype)]
     while any(leaf.dtype.names is not None for leaf in found):
         found = [inner for leaf in found for inner in _opened(leaf)]
@@ -185,7 +184,6 @@ def _write_lines(path: Path, columns: dict[str, npt.NDArray[Any]]) -> None:
 
 
 def _line(cells: Iterable[object]) -> str:
-    """Return a CSV line of cells, quoted where needed."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\r\n").writerow(cells)  # which has \r in quotes too
     return text.getvalue().removesuffix("\r\n") + "\n"

@@ -44,7 +44,6 @@ Block = dict[str, npt.NDArray[Any]]
 
 
 def package(name: str, what: str, *, extra: str = "convert") -> Any:
-    """Return a package of an extra, imported when it is needed."""
     try:
         return import_module(name)
     except ImportError:
@@ -117,8 +116,6 @@ def sensor_names(structure: Structure) -> list[str]:
 
 
 class TableSource(Protocol):
-    """A file that is converted."""
-
     path: Path
     start_ns: int
     tables: Sequence[Table]
@@ -353,7 +350,6 @@ class RecordedSource:
 
     @property
     def events(self) -> list[dict[str, Any]]:
-        """See :class:`skinware.conversion.tables.TableSource`."""
         return [event for event in self._in_time(self._recording.events) if event.get("service") not in self._left_out]
 
     @property

@@ -122,7 +122,6 @@ class Target:
 
     @property
     def paths(self) -> list[Path]:
-        """The files that exist now."""
         return [file.path for file in self._files if file.is_there]
 
     @property
@@ -132,12 +131,10 @@ class Target:
 
     @property
     def counts(self) -> Counter[int]:
-        """Messages of each channel in them."""
         return sum((file.counts for file in self._files), Counter())
 
     @property
     def is_full(self) -> bool:
-        """Whether the recording has reached its greatest size."""
         return False
 
     def add(self, chunk: ClosedChunk, heads: Collection[Head]) -> None:
@@ -228,7 +225,6 @@ class Past(Target):
             self._chunks.popleft()
 
     def save(self) -> None:
-        """Write the chunks that are kept; they also stay in memory."""
         number = len(self._files) + 1
         file = RecordingFile(self._path if number == 1 else _numbered(self._path, number, 1))
         self._files.append(file.file)

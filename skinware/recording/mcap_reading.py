@@ -134,7 +134,6 @@ class McapSource:
             return ""
 
     def contents(self, place: ChunkPlace) -> ChunkContents:
-        """Return the contents of a chunk, or raise Damaged."""
         try:
             compressed = self._data[place.compressed_at : place.end]
             if zstandard.frame_content_size(compressed) not in (-1, place.size):

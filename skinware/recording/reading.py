@@ -28,8 +28,6 @@ from skinware.transfer.generation import Generation, RecordedDriverSnapshot, Rec
 
 @dataclass
 class _Service:
-    """The channels of a service (0: none), and its generations by number."""
-
     frame_channel: int = 0
     head_channel: int = 0
     generations: dict[int, Generation] = field(default_factory=dict)

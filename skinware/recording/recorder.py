@@ -135,7 +135,6 @@ class Recorder:
 
     @property
     def missed(self) -> int:
-        """Samples that were published meanwhile and could not be taken."""
         return self._collector.missed
 
     @property
@@ -218,8 +217,6 @@ class _Stream:
 
 @dataclass(frozen=True)
 class _WireStream:
-    """The buses of a driver's wire service, and the driver's description of itself."""
-
     driver: str
     buses: list[str]
     about: dict[str, Any]
@@ -351,7 +348,6 @@ class _Coder(threading.Thread):
 
 
 def _wires_of(segment: segments.Segment) -> _WireStream | None:
-    """Return the buses of a wire service; None for other services."""
     columns = {column.name for column in segment.layout.slot}
     if bytes(segment.header["kind"]).decode() != KIND or columns != COLUMNS.keys():
         return None

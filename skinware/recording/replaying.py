@@ -186,7 +186,6 @@ class Replayer:
 
     @property
     def frames(self) -> Counter[str]:
-        """Number of published samples, by service."""
         return self._republisher.frames
 
     def run(self, report: Callable[[], object] = lambda: None, every_s: float = 1.0) -> None:
@@ -231,7 +230,6 @@ class Replayer:
         self._stopping = True
 
     def close(self) -> None:
-        """Withdraw the published services. Idempotent."""
         self._ahead.shutdown()
         self._republisher.close()
 

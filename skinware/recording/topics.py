@@ -72,8 +72,6 @@ SCHEMAS = {
 
 
 class Channels:
-    """The channels of a file, numbered as they are needed."""
-
     def __init__(self) -> None:
         self._channels: dict[str, Channel] = {}
 
@@ -87,7 +85,6 @@ class Channels:
         return self.of(f"/wire/{driver}/{bus}", WIRE_ENCODING, SCHEMAS[WIRE], {"driver": driver, "bus": bus})
 
     def of_about(self, driver: str) -> tuple[Channel, Schema]:
-        """Return the channel in which a driver describes itself."""
         return self.of(f"/wire/{driver}", "json", SCHEMAS[ABOUT], {"driver": driver})
 
     def names(self) -> dict[int, str]:
@@ -96,7 +93,6 @@ class Channels:
     def of(
         self, topic: str, encoding: str, schema: Schema, metadata: dict[str, str] | None = None
     ) -> tuple[Channel, Schema]:
-        """Return the channel of a topic, made if it is new, and the schema."""
         channel = self._channels.get(topic)
         if channel is None:
             channel = Channel(len(self._channels) + 1, topic, encoding, metadata or {}, schema.id)

@@ -66,7 +66,6 @@ FRAME = np.dtype(
 
 
 def message_of(frame: Sample) -> bytes:
-    """Return the message of a sample of a driver's wire service."""
     used = int(frame.column("used")[()])
     header = _HEADER.pack(frame.generation, frame.sequence, frame.published_ns, int(frame.column("missed")[()]))
     return header + frame.column("pieces")[:used].tobytes()

@@ -68,7 +68,6 @@ class Origin:
         return self.recording or self.namespace.name
 
     def look(self) -> list[LiveDriver]:
-        """Look for drivers and services that came or went, and return all drivers by name."""
         drivers = self.live.look()
         if self._calm is not None:
             self._calm.look()

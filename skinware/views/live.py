@@ -161,7 +161,6 @@ class LiveDrivers:
         return self._live.get(name)
 
     def look(self) -> list[LiveDriver]:
-        """Return all drivers by name."""
         self._drivers.look()
         if self._drivers.trouble:
             raise NamespaceError(self._drivers.trouble)
@@ -259,7 +258,6 @@ class Overview:
         return self.drivers.look()
 
     def contacts_on(self, driver: LiveDriver) -> list[TouchedPlace] | None:
-        """Return the contacts on a driver with their places; None where no service publishes any."""
         sample = self.contacts.of(driver.name)
         return None if sample is None else places_of(sample, driver.structure)
 

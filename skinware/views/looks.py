@@ -102,7 +102,6 @@ _DECODER = msgspec.json.Decoder(Operation)
 
 
 def operation_of(text: str | bytes) -> Operation:
-    """Return an operation from its JSON, or raise ConfigurationError."""
     try:
         operation: Operation = _DECODER.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:  # a ValidationError is a DecodeError

@@ -78,7 +78,6 @@ class PlotRows:
         self._rows.append((time_ns, values))
 
     def block(self, number: int, of: str, lines: list[int], *, begins: bool = False) -> PlotBlock:
-        """Return the rows, and forget them."""
         rows = list(self._rows)
         self._rows.clear()
         values = np.array([values for _, values in rows], np.float64).reshape(len(rows), len(lines))
@@ -114,7 +113,6 @@ class _Feed:
         return len(self.rows) > 0
 
     def block(self) -> PlotBlock:
-        """Return the samples that wait; they are forgotten."""
         return self.rows.block(self.number, self.of, list(self.lines))
 
 
@@ -159,7 +157,6 @@ class Plots:
                 self._feeds.pop(source).reader.close()
 
     def blocks(self) -> list[PlotBlock]:
-        """Return the values that came since the last call."""
         waiting, self.has_news = list(self._waiting), False
         self._waiting.clear()
         return waiting + [block for feed in self._feeds.values() if len((block := feed.block()).time_ns)]
@@ -170,7 +167,6 @@ class Plots:
         self._feeds, self._lines = {}, []
 
     def _find(self) -> None:
-        """Open the services that have the lines, and close the others."""
         self._look_ns = now_ns() + _LOOK_EVERY_NS
         if self._follower.edition != self._edition:
             return

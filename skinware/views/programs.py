@@ -195,7 +195,6 @@ class ReplayControl:
             )
 
     def act(self, action: str, value: int | float | bool | None, complain: Callable[[str], object]) -> None:
-        """Call an operation of the replay; call ``complain`` with the reason if it fails."""
         if self._replayed is None:
             raise ConfigurationError("no replay is shown")
         name = REPLAY_VALUES[action]

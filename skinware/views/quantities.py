@@ -142,7 +142,6 @@ def types_of(structure: Structure) -> list[SensorType]:
 
 
 def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
-    """Return all quantities of a skin in the order of :func:`types_of`; at least one."""
     types = {t.name: t for t in types_of(structure)}
     names: dict[str, str] = {}
     axes: dict[str, tuple[str, str]] = {}

@@ -72,7 +72,6 @@ class RecordedPlots:
                 self._job = self._reading.submit(self._read_parts, parts, self._number)
 
     def blocks(self) -> list[PlotBlock]:
-        """Return the values that were read since the last call."""
         found = [self._blocks.popleft() for _ in range(len(self._blocks))]
         self.has_news = False
         return found

@@ -225,7 +225,6 @@ class _Body:
 
 
 def _bodies(geometries: Mapping[str, Geometry]) -> list[_Body]:
-    """Return all bodies, in the order of their drivers."""
     found: list[_Body] = []
     for driver, geometry in geometries.items():
         for frame in sorted(_frames(geometry)):

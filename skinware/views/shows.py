@@ -224,7 +224,6 @@ class Show:
 
     @property
     def replays(self) -> list[dict[str, Any]]:
-        """The states of the replays, each with the title of its recording."""
         if self.played:
             return [{**one.state, "title": one.title, "began_s": one.began_s} for one in self.played]
         return [] if self._control.state is None else [self._control.state]

@@ -37,7 +37,6 @@ class Blobs:
         self._size = 0
 
     def add(self, array: npt.NDArray[Any], dtype: str) -> list[int]:
-        """Add an array, and return its place as headers name it."""
         data = np.ascontiguousarray(array, dtype).tobytes()
         at = [self._size, len(data)]
         padded = -len(data) % _ALIGNMENT

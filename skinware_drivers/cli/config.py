@@ -198,7 +198,6 @@ def _confirm(what: str, description: str, yes: bool) -> None:
 
 
 def _value(text: str) -> Any:
-    """Return a value in JSON, or else the text."""
     import msgspec
 
     try:

@@ -273,7 +273,6 @@ def print_capture(capture: Capture, as_json: bool) -> None:
 
 
 async def report(runner: Runner) -> None:
-    """Print its state each second, for programs, until the pipe is closed."""
     while True:
         await asyncio.sleep(1)
         if runner.ready:

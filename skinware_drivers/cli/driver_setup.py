@@ -91,8 +91,6 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ConfigFile:
-    """A configuration file, or none; errors name file, line and key."""
-
     def __init__(self, path: Path | None) -> None:
         self._text = TomlText(path)
         self.settings = DriverConfig()

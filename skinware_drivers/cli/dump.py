@@ -212,7 +212,6 @@ def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
 
 
 def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> Iterator[DriverSnapshot]:
-    """Yield the newest snapshot at the deadlines of a rate, each once."""
     from skinware.realtime import Periodic
 
     timer = Periodic(rate_hz)

@@ -83,8 +83,6 @@ class SignalWatch:
 
 
 class Stop(Protocol):
-    """Ends a run."""
-
     stopped: bool
 
     def fileno(self) -> int:

@@ -16,8 +16,6 @@ from skinware.text import nearest_name
 
 
 class Tool(NamedTuple):
-    """The module of a command, and its purpose in a line."""
-
     module: str
     summary: str
 
@@ -59,8 +57,6 @@ _SHELLS = ("bash", "zsh", "fish")
 
 
 class CommandGroup(click.Group):
-    """A group whose commands are imported when they are needed."""
-
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - of click
         return [*COMMANDS, "completion"]
 

@@ -61,8 +61,6 @@ class _Growth:
 
 
 class DriverLog:
-    """Sum up the snapshots of one structure of a driver."""
-
     def __init__(self, structure: Structure, driver: str) -> None:
         self.structure = structure
         self.newest: DriverSnapshot | None = None
@@ -80,7 +78,6 @@ class DriverLog:
         self._is_lit: npt.NDArray[np.bool_] = np.zeros(structure.n_sensors, bool)
 
     def take(self, frame: DriverSnapshot, tables: Tables, time_s: float) -> None:
-        """Add a snapshot."""
         bus_names, bus_counts = counters_of(frame, tables, "bus", len(self.structure.buses))
         patch_names, patch_counts = counters_of(frame, tables, "patch", self.structure.n_patches)
         before = self.newest
@@ -153,7 +150,6 @@ class DriverLog:
         )
 
     def buses(self) -> tuple[BusSeen, ...]:
-        """Return the buses in the newest snapshot; none before the first."""
         frame = self.newest
         if frame is None or self._buses is None:
             return ()
@@ -177,7 +173,6 @@ class DriverLog:
         return tuple(found)
 
     def patches(self, status: npt.NDArray[np.uint8], at_ns: int) -> tuple[PatchSeen, ...]:
-        """Return the patches in the newest snapshot, as :meth:`seen` does; none before the first."""
         frame, structure = self.newest, self.structure
         if frame is None or self._patches is None:
             return ()
@@ -253,8 +248,6 @@ def whole_lines(structure: Structure, bad: npt.NDArray[np.bool_]) -> tuple[str, 
 
 
 class TaxelJudge:
-    """Judge the health of the taxels of one structure by its snapshots."""
-
     def __init__(self, structure: Structure, driver: str) -> None:
         self._structure = structure
         self._first_ns = self._due_ns = self._last_ns = 0
@@ -269,7 +262,6 @@ class TaxelJudge:
         self._health = ChainHealth(self._chain, driver)
 
     def take(self, frame: DriverSnapshot) -> None:
-        """Add a snapshot, unless it comes too soon after the one before."""
         if self._why_not or frame.acquired_ns < self._due_ns:
             return
         self._first_ns = self._first_ns or frame.acquired_ns
@@ -305,7 +297,6 @@ class TaxelJudge:
 def taxel_faults(
     structure: Structure, positions: npt.NDArray[np.int64], report: HealthReport
 ) -> tuple[TaxelFault, ...]:
-    """Return the faulty taxels of a report on the sensors at some positions of a structure."""
     units = {sensor_type.id: sensor_type.unit for sensor_type in structure.types}
     faults = []
     for row in np.flatnonzero(report.faulty).tolist():

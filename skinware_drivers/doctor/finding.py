@@ -36,8 +36,6 @@ class Finding:
 
 @dataclass(frozen=True)
 class Looked:
-    """Something that was examined."""
-
     area: str = field(default="", kw_only=True)
     what: str
     seen: str
@@ -45,8 +43,6 @@ class Looked:
 
 @dataclass(frozen=True)
 class NotLooked:
-    """Something that could not be examined."""
-
     area: str = field(default="", kw_only=True)
     what: str
     why: str

@@ -210,8 +210,6 @@ _MEMORY = Path("/proc/meminfo")
 
 
 class MachineWatch:
-    """Examine the machine at the beginning and at the end of the look."""
-
     def __init__(self) -> None:
         self._softnet = softnet_dropped()
         self._clock_s = time.time() - time.monotonic()
@@ -294,7 +292,6 @@ def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
 
 
 def look(namespace: Namespace, seconds: float, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
-    """Examine everything that runs or is plugged in."""
     machine, readers_before = MachineWatch(), _readers(namespace)
     counts_before = {one.name: _counts(one) for one in interfaces.can_interfaces()}
     namespaces = namespaces_seen(namespace)

@@ -38,7 +38,6 @@ _PartT = TypeVar("_PartT", BusSeen, PatchSeen)
 
 
 def look_at(file: Path, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
-    """Examine a whole recording."""
     with skinware.recording.open(file) as recording:
         events = recording.events
         drivers = {name: _DriverTrack(name) for name in recording.drivers}
@@ -88,8 +87,6 @@ def _recording_seen(recording: Recording, events: Sequence[dict[str, Any]]) -> R
 
 
 class _DriverTrack:
-    """Follow one driver of a recording through its restarts."""
-
     def __init__(self, name: str) -> None:
         self._name = name
         self._logs: list[DriverLog] = []
@@ -102,7 +99,6 @@ class _DriverTrack:
         self._longest_gap_ns = 0
 
     def take(self, frame: RecordedDriverSnapshot, tables: Any, time_s: float) -> None:
-        """Add a snapshot."""
         before, self._newest = self._newest, frame
         self._frames += 1
         self._age.add(max(0, frame.published_ns - frame.acquired_ns))

@@ -87,7 +87,6 @@ class Disguise:
         self._hosts: dict[str, str] = {}
 
     def __call__(self, text: str) -> str:
-        """Return a text in disguise; a host keeps its new name."""
         hidden = _HOST.sub(lambda found: self._hosts.setdefault(found[0], f"host{len(self._hosts) + 1}"), text)
         return scrubbed(hidden, self._secrets)
 
@@ -97,7 +96,6 @@ def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
 
 
 def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None = None) -> str:
-    """Return the report."""
     about = "a running skin" if evidence.recording is None else f"the recording {evidence.recording.name}"
     span = age_text(evidence.seconds * 1e9)
     drivers, findings = plural(len(evidence.drivers), "driver"), plural(len(found.findings), "finding")

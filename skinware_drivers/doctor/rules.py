@@ -74,7 +74,6 @@ def loss_seen(counted: Counted, name: str, unit: str, evidence: Evidence, beside
 
 
 def brief(bus_name: str) -> str:
-    """Return the name of a bus without its options."""
     return bus_name.partition("?")[0]
 
 

@@ -43,8 +43,6 @@ class IdentifierClass:
 
 
 class Traffic:
-    """The frames of a bus; give :meth:`take` to the reader of the bus."""
-
     def __init__(self) -> None:
         self.frames: int = 0
         self._kept = 0
@@ -155,7 +153,6 @@ async def patches_heard(traffic: Traffic, bus: Bus, adapter: AnyAdapter) -> list
 
 
 def matching_rows(frame: Frame, wire: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """Return (n,) bool: the frames of a kind."""
     identifier, payload, length = wire["identifier"], wire["payload"], wire["length"]
     match = np.isin(length, list(frame.length))
     match &= ((identifier & EXTENDED_FLAG) != 0) == frame.extended
@@ -237,7 +234,6 @@ class _HeardLink(Link):
 
 
 async def _describe(adapter: AnyAdapter, bus: Bus, heard: dict[Heard, int]) -> Sequence[Patch]:
-    """Return the patches that a listening driver would describe."""
     try:
         return await asyncio.wait_for(adapter.describe(_HeardLink(bus, heard)), _NAMING_S)
     except (BusError, TimeoutError):

@@ -188,7 +188,6 @@ def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAd
 
 
 def can_ask(driver: type[AnyAdapter]) -> bool:
-    """Return whether a driver has a harmless question."""
     return inspect.getattr_static(driver, "identify") is not inspect.getattr_static(Adapter, "identify")
 
 

@@ -42,8 +42,6 @@ class UsbIdentity:
 
 @dataclass(frozen=True)
 class User:
-    """A process that has a port open."""
-
     pid: int
     program: str
 
@@ -107,7 +105,6 @@ class Machine:
 
 
 def serial_ports(machine: Machine | None = None) -> list[SerialPort]:
-    """Return all serial ports with hardware, in the order of their numbers."""
     machine = machine or Machine()
     devices = {
         folder.name: (folder / "device").resolve()
@@ -223,7 +220,6 @@ _NO_LETTER = re.compile(r"[^A-Za-z0-9_.:-]")
 
 
 def shipped_rules() -> str:
-    """Return the shipped rules for the usual adapters of skins."""
     return (files("skinware_drivers") / "data" / RULES_FILE).read_text()
 
 

@@ -20,8 +20,6 @@ _PRIVATE = "virtual"
 
 @dataclass(frozen=True)
 class RunningDriver:
-    """A driver whose process lives."""
-
     name: str
     namespace: str
     driver_type: str
@@ -36,7 +34,6 @@ class RunningDriver:
 
 
 def running_drivers() -> list[RunningDriver]:
-    """Return all living drivers in namespaces that this user may read."""
     found = []
     for folder in sorted(ROOT.glob(f"{_PREFIX}*")):
         with contextlib.suppress(ConfigurationError, NamespaceError):

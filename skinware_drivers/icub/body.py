@@ -62,7 +62,6 @@ def read_text(path: Path) -> str:
 
 
 def read_positions(path: Path, notes: Notes) -> Positions:
-    """Read a position file; note oddities."""
     text = read_text(path)
     head, mark, body = text.partition(_CALIBRATION)
     found = _REPRESENTATIVES.search(head)
@@ -170,7 +169,6 @@ def is_drawing(text: str) -> bool:
 
 
 def read_drawing(path: Path, text: str, notes: Notes) -> Drawing:
-    """Read a drawing; note lines that are not understood."""
     drawing = Drawing(path, "")
     in_sensors, unused = False, set[str]()
     for line_number, line in enumerate(text.splitlines(), 1):

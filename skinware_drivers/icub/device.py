@@ -31,8 +31,6 @@ class Group:
 
 
 class DeviceReader:
-    """Find the devices of files, each file and device once."""
-
     def __init__(self, notes: Notes) -> None:
         self._notes = notes
         self._files: dict[Path, Element | ConfigurationError] = {}
@@ -105,7 +103,6 @@ class DeviceReader:
                 group.others.append(child)
 
     def _include(self, element: Element, target: str, trail: list[Path], *, is_needed: bool) -> Element | None:
-        """Return the root of an included file; None if there is none, which is noted."""
         path = _find(target, element.file)
         if path is None:
             self._notes.at(element, "missing" if is_needed else "info", f"{target!r} is not there")
@@ -190,7 +187,6 @@ class Wrapper:
 
 
 def read_wrapper(group: Group) -> Wrapper:
-    """Read a wrapper; note values that make no sense."""
     notes = Notes()
     ports = [port for element in group.lists.get("ports", ()) if (port := _port(element, notes)) is not None]
     if not ports:

@@ -90,7 +90,6 @@ class ImportedPart:
         return configuration_text("roboskin", self.name, buses, lines, geometry)
 
     def geometry(self, *, by_port: bool = False) -> str:
-        """Return a file with the places of its sensors, with the keys of its ports or buses."""
         groups, by = self.groups, ""
         if by_port:
             groups = [group for bus, port in enumerate(self.yarp) for group in on_bus(bus, port.groups)]
@@ -306,7 +305,6 @@ class _Sources:
         return candidates[0] if candidates else None
 
     def name_unused(self, ports: set[str]) -> None:
-        """Note the files of body parts that are not imported."""
         for name in self._chosen:
             if name not in ports:
                 raise ConfigurationError(f"--positions {name}=...: no part that is imported has a port of this name")

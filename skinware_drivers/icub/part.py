@@ -83,8 +83,6 @@ class DevicePart:
 
 
 class PartReader:
-    """Read a skin device; note values that make no sense."""
-
     def __init__(self, name: str, device_type: str, group: Group, notes: Notes) -> None:
         self.notes = notes
         self._group = group

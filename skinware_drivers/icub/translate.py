@@ -284,7 +284,6 @@ class PartPort:
 
     @property
     def uids(self) -> list[int]:
-        """Return the uids of its sensors that feel touch, without the bus."""
         return [
             first + channel
             for run in self.options.triangles

@@ -98,7 +98,6 @@ class Notes:
             return None
 
     def number(self, element: Element | None, first: int, last: int) -> int | None:
-        """Return the one number of an element, within limits."""
         found = self.numbers(element)
         if element is None or found is None:
             return None
@@ -131,12 +130,10 @@ class Notes:
 
 
 def words(text: str) -> list[str]:
-    """Return the words of a value, without quotes and brackets."""
     return text.translate(str.maketrans('()"', "   ")).split()
 
 
 def number(text: str) -> int:
-    """Return a whole number as these files write it."""
     if len(text) > _LONGEST_NUMBER or not text.isascii() or "_" in text:
         raise ValueError(f"{text[:20]!r} is not a whole number")
     try:

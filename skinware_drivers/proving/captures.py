@@ -71,7 +71,6 @@ def check_capture(
 
 
 def decoded_then(capture: Path) -> Decoding:
-    """Return the values that the driver published during the capture."""
     with skinware.recording.open(capture) as recording:
         wires = _wires(recording)
         found = Collected(_began_ns(recording, wires))
@@ -85,7 +84,6 @@ def decoded_then(capture: Path) -> Decoding:
 def decoded_now(
     capture: Path, driver: type[AnyAdapter] | None = None, options: Mapping[str, Any] | None = None
 ) -> Decoding:
-    """Return the values that a driver decodes from a capture now; see :func:`check_capture`."""
     with skinware.recording.open(capture) as recording:
         wires = _wires(recording)
         about = recording.about(wires[0].driver)

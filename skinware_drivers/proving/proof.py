@@ -17,8 +17,6 @@ from skinware_drivers.doctor.report import Secrets, scrubbed
 
 
 class Verdict(enum.StrEnum):
-    """The result of a check."""
-
     PASSED = "passed"
     FAILED = "failed"
     SKIPPED = "skipped"
@@ -46,7 +44,6 @@ class Proof:
     checks: list[Check] = field(default_factory=list)
 
     def add(self, what: str, where: str, verdict: Verdict | bool, seen: str) -> None:
-        """Add a check; True and False are passed and failed."""
         if isinstance(verdict, bool):
             verdict = Verdict.PASSED if verdict else Verdict.FAILED
         self.checks.append(Check(what, where, verdict, seen))

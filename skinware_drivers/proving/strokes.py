@@ -24,8 +24,6 @@ _SURE = 0.5
 
 
 class Matrix(NamedTuple):
-    """Taxels in rows and columns, row by row."""
-
     rows: int
     columns: int
 

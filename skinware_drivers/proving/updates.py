@@ -177,7 +177,6 @@ def _without_partner(of: ModuleUpdates, row: int, *, is_then: bool) -> Differenc
 
 
 def save(decoding: Decoding, path: Path) -> None:
-    """Write the expected values of a capture."""
     arrays: dict[str, Any] = {}
     for number, (uids, of) in enumerate(decoding.items()):
         arrays |= {

@@ -34,16 +34,12 @@ _UNUSABLE = int(Status.NEVER_SEEN | Status.STALE | Status.MASKED)
 
 
 class Step(NamedTuple):
-    """A request to a person."""
-
     wanted: Wanted
     module: str
     text: str
 
 
 class Person(Protocol):
-    """The person with the device."""
-
     def ask(self, step: Step) -> None:
         """Show a request, without waiting."""
 

@@ -188,7 +188,6 @@ class VirtualCanBus(EmulatedBus):
         self._wake_when_due()
 
     def close(self) -> None:
-        """Stop listening; the devices live on. Idempotent."""
         if self._timer is not None:
             self._timer.close()
             self._timer = None
@@ -208,7 +207,6 @@ class VirtualCanBus(EmulatedBus):
     # Within
 
     def _append(self, batch: FrameBatch, ordinal: int, frames: Sequence[WireFrame]) -> None:
-        """Write all frames as rows of :func:`skinware_drivers.bus.wire_dtype` at once."""
         pack = _packer(batch.payload_size)
         rows = b"".join([pack(identifier, len(payload), payload) for _, identifier, payload in frames])
         stop = batch.stop + len(frames)
@@ -241,8 +239,6 @@ def _packer(payload_size: int) -> Callable[[int, int, bytes], bytes]:
 
 
 class PlacedCanBus(VirtualCanBus):
-    """A :class:`.VirtualCanBus` by name; see :class:`.hardware.PlacedHardware`."""
-
     hardware: PlacedHardware
 
     @property
@@ -289,16 +285,12 @@ class VirtualSerialBus(EmulatedLine, SerialBus):
 
 
 class VirtualModbusBus(EmulatedLine, ModbusBus):
-    """Emulated Modbus devices as a bus, with a name as that of ``VirtualCanBus``."""
-
     def cycle_s(self, wanted: Wanted, baudrate: int) -> float:  # noqa: ARG002
         """Return 0: it has no baud rate."""
         return 0.0
 
 
 class EmulatedPort(Port):
-    """The host's end of a line with emulated devices at the other."""
-
     def __init__(self, hardware: EmulatedHardware, clock: Clock) -> None:
         self._hardware, self._clock, self._timer = hardware, clock, clock.timer()
         self._unread: deque[WireFrame] = deque()

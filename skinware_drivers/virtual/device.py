@@ -82,7 +82,6 @@ class Wire:
         return self._busy_ns * self.speed / _BIT_NS
 
     def attach(self) -> deque[Transmission]:
-        """Return the queue of a new device."""
         queue: deque[Transmission] = deque()
         self._queues.append(queue)
         return queue

@@ -43,7 +43,6 @@ class MonotonicTimer:
         self._spec = _Itimerspec()
 
     def fileno(self) -> int:
-        """The descriptor; -1 once closed."""
         return self._fd
 
     def wake_at(self, time_ns: int | None) -> None:
@@ -64,13 +63,10 @@ class MonotonicTimer:
 
 
 class MonotonicClock:
-    """CLOCK_MONOTONIC, ns."""
-
     def __call__(self) -> int:
         return time.monotonic_ns()
 
     def timer(self) -> Timer:
-        """Make an open timer that does not run."""
         return MonotonicTimer()
 
 
@@ -111,7 +107,6 @@ class HandClock:
         return (self.now_ns - _BEGINNING_NS) / 1e9
 
     def timer(self) -> HandTimer:
-        """Make a timer of this clock."""
         timer = HandTimer(self)
         self.timers.add(timer)
         return timer
@@ -125,8 +120,6 @@ class HandClock:
 
 
 class HandTimer:
-    """A :class:`MonotonicTimer` for a :class:`HandClock`."""
-
     def __init__(self, clock: HandClock) -> None:
         self._clock = clock
         self._fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -134,11 +127,9 @@ class HandTimer:
         self.due_ns: int | None = None
 
     def fileno(self) -> int:
-        """The descriptor; -1 once closed."""
         return self._fd
 
     def wake_at(self, time_ns: int | None) -> None:
-        """Make the descriptor readable at ``time_ns``, and not before."""
         self.due_ns = time_ns
         self.look()
 
@@ -164,8 +155,6 @@ Clock = MonotonicClock | HandClock
 
 
 class _PassingTime(selectors.EpollSelector):
-    """A selector that lets time pass where the event loop would sleep."""
-
     def __init__(self, clock: HandClock) -> None:
         super().__init__()
         self._clock = clock
@@ -195,8 +184,6 @@ class _PassingTime(selectors.EpollSelector):
 
 
 class HandLoop(asyncio.SelectorEventLoop):
-    """An event loop in a clock's time."""
-
     def __init__(self, clock: HandClock) -> None:
         self._hand_clock = clock
         super().__init__(_PassingTime(clock))

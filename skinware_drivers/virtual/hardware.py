@@ -100,7 +100,6 @@ class JsonLinesLog:
         self._file.write(self._encoder.encode(event) + b"\n")
 
     def close(self) -> None:
-        """Close the file. Idempotent."""
         self._file.close()
 
 
@@ -116,8 +115,6 @@ Point = tuple[float, float, float]
 
 
 class WireFrame(NamedTuple):
-    """One frame that emulated hardware puts on the wire."""
-
     time_ns: int
     """When it went onto the wire, CLOCK_MONOTONIC ns."""
     identifier: int
@@ -126,8 +123,6 @@ class WireFrame(NamedTuple):
 
 
 class EventLog(Protocol):
-    """The receiver of the events of emulated hardware, for example a list."""
-
     def append(self, event: Event, /) -> None:
         """Take one event. Events come in order of time, except those of a burst, which come together."""
 
@@ -167,8 +162,6 @@ class EmulatedHardware(Protocol):
 
 
 class Pressing(NamedTuple):
-    """A press on the emulated skin."""
-
     at_m: Point
     """Place, in the coordinate frame of the sensors, m."""
     force_n: float = 3.0
@@ -267,5 +260,4 @@ def name_of(emulator: type) -> str:
 
 
 def load_emulator(name: str) -> HardwareFactory:
-    """Return the emulator of a name; see :func:`skinware_drivers.loading.load`."""
     return cast("HardwareFactory", load(_EMULATOR, name))

@@ -44,8 +44,6 @@ _MCAP = b"\x89MCAP"
 
 
 class ReplayOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a recorded bus."""
-
     bus: Annotated[str, msgspec.Meta(description="name of the bus, if several were recorded")] = ""
     driver: Annotated[str, msgspec.Meta(description="driver of the bus, if several had it")] = ""
     speed: Annotated[
@@ -72,8 +70,6 @@ class Recorded(NamedTuple):
 
 
 class ReplayedCanBus(VirtualCanBus):
-    """A recorded CAN bus."""
-
     name = Bus.name
 
 
@@ -104,8 +100,6 @@ class RecordedPort(EmulatedPort):
 
 
 class ReplayedSerialBus(EmulatedLine, SerialBus):
-    """A recorded serial line."""
-
     name = Bus.name
 
     def _open_port(self) -> RecordedPort:
@@ -297,7 +291,6 @@ def recorded_driver(bus_name: str) -> Recorded:
 
 
 def _open(path: str, bus: str) -> Recording | LogFile:
-    """Open a recording, or a log with such a bus in it."""
     try:
         with open(path, "rb") as file:
             if not file.read(len(_MCAP)).startswith(_MCAP):
@@ -326,7 +319,6 @@ def first_of(wires: Sequence[WireSource], start_s: float = 0.0) -> int:
 
 
 def _items(recording: Recording | LogFile, wire: WireSource, wanted: ReplayOptions) -> Iterator[WireItem]:
-    """Yield the wanted items of a wire, then close the recording."""
     with recording:
         yield from wire.items(start_s=wanted.start, end_s=wanted.end)
 

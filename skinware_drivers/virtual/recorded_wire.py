@@ -113,7 +113,6 @@ class RecordedWire:
         self._counts = {"frames": 0, "bursts": 0, "commands": 0}
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> None:
-        """Take a question of this driver."""
         self._counts["commands"] += 1
         self._questions.ask(identifier, payload, now_ns)
 

@@ -116,8 +116,6 @@ def _plain(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 class ParquetSource(ColumnSource):
-    """A Parquet file, or all files of a folder in the order of their names."""
-
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._arrow = pyarrow()

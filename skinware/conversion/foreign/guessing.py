@@ -47,8 +47,6 @@ _GENERIC = ("", "taxel", "taxels", "sensor", "s", "t", "value", "values", "data"
 
 
 class _Guess(NamedTuple):
-    """A module of so many taxels, and the reason."""
-
     map: ModuleMap
     taxels: int
     why: str
@@ -203,7 +201,6 @@ def _arrays(name: str, shape: Sequence[int], driver: str) -> Iterator[_Guess]:
 
 
 def _numbered(pattern: str, names: Sequence[str], driver: str) -> Iterator[_Guess]:
-    """Yield the modules of columns whose names differ in numbers only."""
     numbers = {name: tuple(_NUMBER.findall(name)) for name in names}
     axis = _AXIS.search(pattern)
     type_name, unit, why = _type_of(pattern, (axis[2] or axis[3]).lower() if axis else "")
@@ -244,7 +241,6 @@ def _ranges(pattern: str, group: Sequence[str], numbers: Mapping[str, tuple[str,
 
 
 def _type_of(name: str, axis: str) -> tuple[str, str, str]:
-    """Return type, unit, and the reason."""
     said = _UNITS.search(_NUMBER.sub("", name).rstrip("_. #"))
     unit = _UNIT_NAMES.get(said[1].lower(), said[1].lower()) if said else "counts"
     for words, (type_name, axes) in _TYPES.items():

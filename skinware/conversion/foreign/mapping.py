@@ -101,8 +101,6 @@ class _MapFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pick(NamedTuple):
-    """Numbers of a row of a column, in the order of the taxels."""
-
     column: str
     numbers: npt.NDArray[np.int64]
 
@@ -120,7 +118,6 @@ class MappedDriver(NamedTuple):
 
 
 def read_map(path: Path, source: ColumnSource) -> list[MappedDriver]:
-    """Read a map for a source."""
     text = TomlText(path)
     drivers = text.of_format("map of columns", FORMAT, VERSION, _MapFile).driver
     return [_mapped(each, source, text, number) for number, each in enumerate(drivers)]

@@ -66,5 +66,4 @@ def whole(source: ColumnSource, table: str, names: Sequence[str], most: int | No
 
 
 def first_rows(source: ColumnSource, table: str) -> Rows:
-    """Return the first rows of all columns of a table; none if it is empty."""
     return next(source.blocks(table, source.tables[table]), {name: np.zeros(0) for name in source.tables[table]})

@@ -125,7 +125,6 @@ class TextSource(ColumnSource):
             yield name, np.array([cells[place] for _, cells in self._split(lines, first)], str)
 
     def _numbers(self, lines: list[str], first: int, places: list[int]) -> npt.NDArray[np.float64]:
-        """Return (m, len(places)) float64."""
         if not places:
             return np.zeros((len(lines), 0))
         count, separator = self._count, self._separator

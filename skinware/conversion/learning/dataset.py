@@ -67,7 +67,6 @@ class Video:
                 self._mux(self._av.VideoFrame.from_image(image))
 
     def close(self) -> None:
-        """Write what the encoder still holds."""
         self._mux(None)
         self._file.close()
 
@@ -122,7 +121,6 @@ class DatasetWriter:
         self._whole = _FeatureStatistics(self._features, lengths, _SET_SAMPLE_BYTES)
 
     def add_episode(self, task: str, length: int, batches: Iterable[Batch]) -> None:
-        """Write an episode."""
         place = self._data.next_place()
         task_index = self._tasks.setdefault(task, len(self._tasks))
         statistics = _FeatureStatistics(self._features, [length], _EPISODE_SAMPLE_BYTES)
@@ -157,7 +155,6 @@ class DatasetWriter:
         self._episodes.close()
 
     def finish(self) -> None:
-        """Write the description and statistics of the whole dataset."""
         self.close()
         meta = self._folder / "meta"
         _write_tasks(self._arrow, self._tasks, meta / "tasks.parquet")
@@ -302,7 +299,6 @@ class _FeatureStatistics:
                 self._of[name] = Statistics(each.shape, each.dtype, sum(lengths), most_bytes)
 
     def add(self, name: str, rows: npt.NDArray[Any], moments: Moments) -> None:
-        """Add rows of a feature; for images, pixels."""
         self._of[name].add(rows, moments)
 
     def result(self) -> dict[str, dict[str, npt.NDArray[Any]]]:

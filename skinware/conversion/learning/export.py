@@ -192,7 +192,6 @@ class _Set:
             self._features = self._form.described(self._features)
 
     def write(self, folder: Path) -> list[str]:
-        """Write the set, and return a line for each driver whose values were interpolated."""
         lengths, video = [len(each) for each in self._episodes], self._wanted.video
         writer = DatasetWriter(folder, self._wanted.fps, self._features, lengths, video=video)
         try:

@@ -201,8 +201,6 @@ class Frames:
 
 
 class JoinedFeature:
-    """A feature of joined data."""
-
     def __init__(self, joined: Joined) -> None:
         self._joined, self.name = joined, joined.name
         if joined.rows.ndim == 1:
@@ -320,14 +318,12 @@ class ChosenRows:
         self._rows = np.zeros((-(-rows // self._step), *shape), dtype)
 
     def add(self, rows: npt.NDArray[Any]) -> None:
-        """Add (m, ...) rows."""
         chosen = rows[-self._seen % self._step :: self._step]
         self._rows[self._kept : self._kept + len(chosen)] = chosen
         self._kept += len(chosen)
         self._seen += len(rows)
 
     def quantiles(self) -> dict[str, Numbers]:
-        """Return the quantiles of each number of a row."""
         rows = self._rows[: self._kept].reshape(self._kept, -1)
         found = np.zeros((len(QUANTILES), rows.shape[1]))
         for first in range(0, rows.shape[1], _AT_ONCE):  # all at once would copy the whole sample

@@ -40,7 +40,6 @@ class SetForm:
         self._images = {name: self._image(name) for name in self._types} if wanted.form == "images" else {}
 
     def described(self, features: Mapping[str, Feature]) -> dict[str, Feature]:
-        """Return the features of the set, in place of those of the drivers."""
         others = {name: each for name, each in features.items() if not name.startswith(_TACTILE)}
         if self._wanted.resample == "linear":
             others[INTERPOLATED] = Feature("float32", (1,))
@@ -61,7 +60,6 @@ class SetForm:
         return others | {STATE: Feature("float32", (len(names),), names)}
 
     def rows(self, batch: Batch) -> Batch:
-        """Return rows of the set's features, made of those of the drivers."""
         others = {name: rows for name, rows in batch.items() if not name.startswith(_TACTILE)}
         if self._wanted.resample == "linear":
             shares = [batch[f"{_TACTILE}{self._key(driver)}.interpolated"] for driver in self._drivers]

@@ -75,5 +75,4 @@ class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
         return [message(bytes([device.memory[_ASKED]]) + positions + bits.to_bytes(45, "little") + b"\0")]
 
     def moves(self) -> int:
-        """Return the number of commands to move since power-up."""
         return sum(device.memory.get(_MOVES, 0) for device in self.devices.values())

@@ -22,8 +22,6 @@ _FELT, _WANTED = "felt", "wanted"  # in the memory of a device
 
 
 class EmulatedLinkerHandOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the hands, and of their own program."""
-
     hands: Annotated[tuple[int, ...], Meta(description="identifiers of the hands")] = (0x27,)
     touch: Annotated[
         Literal["12x6", "10x4", "fingers", "fingers_90", "hand_23x9", "hand_12x6"],

@@ -81,7 +81,6 @@ class EmulatedPapillArray(SerialEmulator[EmulatedPapillArrayOptions]):
         return lines, rest
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """Obey, without a word."""
         if command in (b"f100", b"f250", b"f500", b"f1000"):
             self.change_period(device, now_ns, 1 / int(command[1:]))
         elif command == b"z":
@@ -109,7 +108,6 @@ class EmulatedPapillArray(SerialEmulator[EmulatedPapillArrayOptions]):
         return felt
 
     def kinds(self) -> Sequence[str]:
-        """Name the blocks of a packet."""
         return list(_KINDS)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
@@ -127,7 +125,6 @@ class EmulatedPapillArray(SerialEmulator[EmulatedPapillArrayOptions]):
         return [b"\x55\x66\x77\x88" + packet + struct.pack("<H", sum(packet) & 0xFFFF) + b"\xaa\xbb\xcc\xdd"]
 
     def _zeroed(self, device: Device, values: Any) -> Any:
-        """Return values less those at the command z."""
         if "zero" not in device.memory:
             return values
         if device.memory["zero"] is None:
@@ -156,7 +153,6 @@ class EmulatedPapillArray(SerialEmulator[EmulatedPapillArrayOptions]):
 
 
 def _block(begin: int, entries: Any) -> bytes:
-    """Return a block at this position of the packet."""
     n, size = len(entries), entries[0].nbytes
     if entries.ndim == 1:
         return _positions(begin, n, size) + bytes(entries.tobytes())

@@ -30,8 +30,6 @@ def message(*parts: bytes) -> bytes:
 
 
 class EmulatedPaxiniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the board, and of the modules at it."""
-
     board: Annotated[
         Literal["converter", "high_speed"], Meta(description="sensors that are asked, or a hand that streams")
     ] = "converter"
@@ -95,7 +93,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
         return cut_packets(heard, b"\x55\xaa", self._length)
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-        """Answer commands with a right LRC."""
         if len(command) <= _NO_COMMAND or sum(command) & 0xFF:
             return None
         if self.options.board == "high_speed":

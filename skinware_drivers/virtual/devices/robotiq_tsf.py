@@ -66,7 +66,6 @@ class EmulatedRobotiqTsf(SerialEmulator[EmulatedRobotiqTsfOptions]):
         return b""
 
     def kinds(self) -> Sequence[str]:
-        """Name the fields of each finger."""
         return [f"{name}{finger}" for finger in self.numbers for name in _FIELDS]
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002

@@ -74,8 +74,6 @@ _TAXELS = {"uSPa44": (16, 4), "uSPa46": (24, 6), "uSPa22": (4, 2), "uSCuAH": (30
 
 
 class EmulatedXelaServerOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of the server and its sensors."""
-
     sensors: Annotated[tuple[int, ...], Meta(description="numbers of the sensors")] = (1,)
     model: Annotated[Literal["uSPa44", "uSPa46", "uSPa22", "uSCuAH"], Meta(description="of all sensors")] = "uSPa44"
     calibrated: Annotated[bool, Meta(description="send forces, besides the counts")] = True

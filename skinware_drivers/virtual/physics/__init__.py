@@ -16,7 +16,6 @@ WORLD_NS = 2_000_000
 
 
 def open_world(options: EmulatorOptions, emulator: type) -> PhysicsWorld | None:
-    """Open the world of the options of an emulator; None: they have none."""
     if not options.world:
         return None
     try:

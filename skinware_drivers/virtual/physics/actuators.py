@@ -40,7 +40,6 @@ class Actuators:
             self._check(pose, f"{bound.file}: pose {name!r}")
 
     def move(self, targets: Mapping[str, float], seconds: float = 0.0) -> None:
-        """Move actuators to targets, evenly within a time."""
         self._check(targets, "move")
         if not 0 <= seconds <= 3600:
             raise ConfigurationError(f"move: {seconds} s: give 0 to 3600")
@@ -54,7 +53,6 @@ class Actuators:
         self._ramps.clear()
 
     def advance(self) -> None:
-        """Set the targets for the next step of the physics."""
         self._begin_moves()
         for actuator, (begin_s, end_s, start, target) in list(self._ramps.items()):
             share = 1.0 if self._data.time >= end_s else (self._data.time - begin_s) / (end_s - begin_s)

@@ -89,8 +89,6 @@ class Move(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
 
 
 class Binding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A file of this format."""
-
     format: str
     version: int
     module: tuple[ModuleBinding, ...]
@@ -102,14 +100,11 @@ class Binding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Bound(msgspec.Struct, frozen=True):
-    """A binding, and where it and its scene are."""
-
     binding: Binding
     file: Path
     scene: Path
 
     def settings(self, module: ModuleBinding) -> TransferSettings:
-        """Return the transfer of a module."""
         try:
             return msgspec.convert({**self.binding.transfer, **module.transfer}, TransferSettings)
         except msgspec.ValidationError as error:

@@ -78,7 +78,6 @@ class PhysicsScene:
 
     @property
     def time_s(self) -> float:
-        """The time of the scene, s."""
         return float(self.data.time)
 
     def step_to(self, time_s: float) -> int:
@@ -104,7 +103,6 @@ class PhysicsScene:
         return found
 
     def touching(self) -> list[Touching]:
-        """Return the contacts of all modules in the newest step."""
         if self._touching is None:
             numbers, sides = np.nonzero(self._is_covered[self.data.contact.geom])
             self._touching = self._touches(numbers, sides) if len(numbers) else []

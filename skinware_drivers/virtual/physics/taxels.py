@@ -55,7 +55,6 @@ class BoundTaxels:
         return self.binding.name or self.binding.body
 
     def group(self, type_name: str, uid: npt.NDArray[np.uint64]) -> GeometryGroup:
-        """Return the taxels as a group of a geometry file, in the frame of the body."""
         return GeometryGroup(
             type=type_name,
             frame=self.binding.body,
@@ -67,7 +66,6 @@ class BoundTaxels:
 
 
 def place(model: Any, module: ModuleBinding, bound: Bound) -> BoundTaxels:
-    """Place the taxels of a module on a body of a compiled scene."""
     name = module.name or module.body
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, module.body)
     if body < 0:
@@ -103,7 +101,6 @@ def place(model: Any, module: ModuleBinding, bound: Bound) -> BoundTaxels:
 
 
 def add_sensors(spec: Any, taxels: list[BoundTaxels]) -> None:
-    """Add a tactile sensor for each geom of each module to a scene."""
     for number, module in enumerate(taxels):
         step = np.arange(max(_FEWEST_VERTICES, len(module.position_m)))
         spiral = np.column_stack([np.cos(step), np.sin(step), 0.1 * step])

@@ -108,7 +108,6 @@ class WorldServices:
         self._scene.actuators.hold()
 
     def close(self) -> None:
-        """Take the services away. Idempotent."""
         self._truth.close()
         self._joints.close()
 
@@ -181,7 +180,6 @@ class PhysicsWorld:
         self._at_end: Callable[[], object] | None = None
 
     def fit(self, numbers: Sequence[int], n_values: int) -> None:
-        """Check that a binding fits the devices of an emulator."""
         for device, end in self._ends.items():
             if device not in numbers:
                 known = ",".join(map(str, numbers))
@@ -206,7 +204,6 @@ class PhysicsWorld:
             self._services.serve(time_ns)
 
     def since_s(self, time_ns: int) -> float:
-        """Return the time of the scene at a time of the devices, s."""
         return (time_ns - (self.origin_ns or 0)) / NS_PER_S * self._speed
 
     def forces(self) -> list[ArrayF]:
@@ -232,7 +229,6 @@ class PhysicsWorld:
         return values
 
     def close(self) -> None:
-        """Take the services away until the physics runs on. Idempotent."""
         self._services = None
         if self._at_end is not None:
             self._at_end()

@@ -100,6 +100,11 @@ class BridgeError(SkinwareError):
 class MissingExtra(SkinwareError, ImportError):
     """Packages that only some need are not installed; the message says how to install them."""
 
+    @classmethod
+    def of(cls, what: str, requirement: str) -> MissingExtra:
+        """Return the error for a purpose and what pip needs to install, such as ``skinware[record]``."""
+        return cls(f"packages for {what} are not installed: pip install '{requirement}'")
+
 
 class DriverError(SkinwareError):
     """A driver's own code failed; the message names bus, hook and cause.

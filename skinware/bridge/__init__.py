@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from skinware.errors import MissingExtra
 
 if find_spec("zenoh") is None:
-    raise MissingExtra("bridges need packages that are not installed: pip install 'skinware[zenoh]'")
+    raise MissingExtra.of("bridges", "skinware[zenoh]")
 
 from skinware.bridge.endpoints import DEFAULT_LISTEN, DEFAULT_ROUTER, Endpoints, Rules, endpoints
 from skinware.bridge.joining import Joiner

@@ -95,7 +95,7 @@ def command(
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
     if find_spec("websockets") is None:
-        raise MissingExtra("skin-view needs a package that is not installed: pip install 'skinware[view]'")
+        raise MissingExtra.of("views", "skinware[view]")
     import skinware.recording
     from skinware.memory.namespace import Namespace, check_name
     from skinware.views.access import Access, is_loopback

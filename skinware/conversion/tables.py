@@ -47,7 +47,7 @@ def package(name: str, what: str, *, extra: str = "convert") -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise MissingExtra(f"{what} needs a package that is not installed: pip install 'skinware[{extra}]'") from None
+        raise MissingExtra.of(what, f"skinware[{extra}]") from None
 
 
 def pyarrow() -> Any:

@@ -201,7 +201,7 @@ def _torch() -> Any:
         import torch
         import torch.utils.data
     except ImportError:
-        raise MissingExtra("tensors need torch, which is not installed: pip install torch") from None
+        raise MissingExtra.of("tensors", "torch") from None
     return torch
 
 

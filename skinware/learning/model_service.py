@@ -158,7 +158,7 @@ def onnx_model(path: str | Path) -> Model:
     try:
         import onnxruntime
     except ImportError:
-        raise MissingExtra("ONNX models need a package that is not installed: pip install 'skinware[onnx]'") from None
+        raise MissingExtra.of("ONNX models", "skinware[onnx]") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1  # more of them would wait busily, beside drivers
     try:

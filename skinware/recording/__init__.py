@@ -19,7 +19,7 @@ from pathlib import Path
 from skinware.errors import MissingExtra
 
 if find_spec("mcap") is None or find_spec("zstandard") is None:
-    raise MissingExtra("recordings need packages that are not installed: pip install 'skinware[record]'")
+    raise MissingExtra.of("recordings", "skinware[record]")
 
 from skinware.recording.reading import Recording
 from skinware.recording.tracks import Series, Track

@@ -18,7 +18,7 @@ from skinware.ros2.messages import DISCOVERY_TOPIC, PARTICIPANT_DATA, endpoint_d
 from skinware.ros2.transport import Cdr, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
 
 if find_spec("cyclonedds") is None:
-    raise MissingExtra("ROS 2 over DDS needs packages that are not installed: pip install 'skinware[ros2]'")
+    raise MissingExtra.of("ROS 2 over DDS", "skinware[ros2]")
 
 from cyclonedds.core import DDSException
 from cyclonedds.idl import IdlStruct

@@ -31,7 +31,7 @@ from skinware.errors import BridgeError, MissingExtra
 from skinware.ros2.transport import Cdr, Distro, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
 
 if find_spec("xxhash") is None:
-    raise MissingExtra("ROS 2 over zenoh needs packages that are not installed: pip install 'skinware[ros2-zenoh]'")
+    raise MissingExtra.of("ROS 2 over zenoh", "skinware[ros2-zenoh]")
 
 import xxhash
 

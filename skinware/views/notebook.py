@@ -37,7 +37,7 @@ class View:
 
     def __init__(self, *names: str | Path, namespace: Namespace | str | None = None, height: int = 600) -> None:
         if find_spec("websockets") is None:
-            raise MissingExtra("this needs a package that is not installed: pip install 'skinware[view]'")
+            raise MissingExtra.of("views", "skinware[view]")
         files = [Path(name) for name in names if str(name).endswith(SUFFIX)]
         drivers = [str(name) for name in names if not str(name).endswith(SUFFIX)]
         place = Namespace.of(namespace)

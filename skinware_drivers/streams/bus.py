@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-from importlib.util import find_spec
 from typing import Annotated, Any, ClassVar, NamedTuple
 from urllib.parse import urlsplit
 
@@ -114,16 +113,6 @@ def _mistake(channel: str) -> str:
     if not port.isdecimal() and "/" not in port:
         return f"{port!r} is no port number"
     return "ports have numbers up to 65535" if port.isdecimal() and int(port) > 65535 else ""
-
-
-def need_package(what: str, package: str, extra: str) -> None:
-    """Refuse a bus whose package is not installed.
-
-    Raises:
-        ConfigurationError: it is not.
-    """
-    if find_spec(package) is None:
-        raise ConfigurationError(f"{what}: needs the package {package}: pip install 'skinware[{extra}]'")
 
 
 class StreamBus(SerialBus):

@@ -12,12 +12,13 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
-from skinware.errors import ConfigurationError
+from skinware.errors import ConfigurationError, MissingExtra
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.ros2.transport import HIGHEST_DOMAIN
 from skinware.ros_types import Definitions, dds_name, ros_name
@@ -30,14 +31,13 @@ from skinware_drivers.serial.checksums import CRC32
 from skinware_drivers.serial.framing import Field
 from skinware_drivers.serial.packets import Length, Packet
 from skinware_drivers.serial.ports import Port
-from skinware_drivers.streams.bus import MessagePort, ServerBus, need_package
+from skinware_drivers.streams.bus import MessagePort, ServerBus
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 ENCAPSULATION = 4
 LONGEST = 1 << 20
 """Bytes of the longest sample that is read."""
-_PACKAGE = "cyclonedds", "ros2"
 _SYNC = b"\xdd\x5a"
 _HEAD = struct.Struct("<2sIHI")
 _STAMP_NS = 10_000
@@ -90,6 +90,11 @@ class HeardTopic:
         return ros_name(self.type_name)
 
 
+def _need_package() -> None:
+    if find_spec("cyclonedds") is None:
+        raise MissingExtra.of("a bus dds", "skinware[ros2]")
+
+
 def samples(longest: int) -> Packet:
     """Return the framing of records.
 
@@ -127,7 +132,7 @@ class DdsOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _device_end(channel: str, options: dict[str, str] | None = None, **more: Any) -> Bus:
-    need_package(f"bus dds://{channel}", *_PACKAGE)
+    _need_package()
     from skinware_drivers.streams.dds_ends import DdsDeviceBus
 
     return DdsDeviceBus(channel, options, **more)
@@ -306,7 +311,7 @@ class DdsBus(TopicBus):
 
     def _parse(self, channel: str) -> int:
         domain = parse_domain(channel)
-        need_package(self.name, *_PACKAGE)
+        _need_package()
         return domain
 
     def _join(self, topics: Sequence[DdsTopic]) -> TopicPort:

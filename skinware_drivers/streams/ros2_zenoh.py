@@ -23,7 +23,7 @@ from skinware_drivers.bus import Bus
 from skinware_drivers.streams.dds import LONGEST, DdsTopic, TopicBus, TopicPort, TopicSource, parse_domain, record
 
 if find_spec("zenoh") is None or find_spec("xxhash") is None:
-    raise MissingExtra("a bus ros2:// needs packages that are not installed: pip install 'skinware[ros2-zenoh]'")
+    raise MissingExtra.of("a bus ros2", "skinware[ros2-zenoh]")
 
 from skinware.bridge.link import Link
 from skinware.ros2.rmw_zenoh import ROUTER, MessageAttachment, gid, graph_endpoints

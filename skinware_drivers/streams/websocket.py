@@ -33,7 +33,7 @@ from skinware_drivers.streams.bus import (
 from skinware_drivers.streams.tcp import ListeningPort, connect, keep_alive
 
 if find_spec("websockets") is None:
-    raise MissingExtra("a bus websocket: needs a package that is not installed: pip install 'skinware[websocket]'")
+    raise MissingExtra.of("a bus websocket", "skinware[websocket]")
 
 from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidURI

@@ -249,9 +249,7 @@ def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "skinware.ros2.dds")
     done = refused("skin-bridge", "ros2")
     assert done.returncode == 1
-    assert done.stderr == (
-        "skin-bridge: ROS 2 over DDS needs packages that are not installed: pip install 'skinware[ros2]'\n"
-    )
+    assert done.stderr == ("skin-bridge: packages for ROS 2 over DDS are not installed: pip install 'skinware[ros2]'\n")
 
 
 @pytest.mark.parametrize("fields", [{"name": "1st"}, {"name": "a b"}, {"namespace": "x"}, {"domain": -1}])

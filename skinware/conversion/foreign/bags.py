@@ -34,8 +34,8 @@ class BagSource(ColumnSource):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        bags = package("rosbags.highlevel", "A bag of ROS")
-        stores = package("rosbags.typesys", "A bag of ROS")
+        bags = package("rosbags.highlevel", "bags of ROS")
+        stores = package("rosbags.typesys", "bags of ROS")
         self._files = ExitStack()
         with self._blamed("open it with its own tools, or record it again"):
             usual = stores.get_typestore(stores.Stores.LATEST)

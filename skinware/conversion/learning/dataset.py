@@ -41,7 +41,7 @@ class Video:
     """
 
     def __init__(self, path: Path, fps: int, shape: tuple[int, ...]) -> None:
-        self._av, self._images = package("av", "a data set with videos"), package("PIL.Image", "a data set with videos")
+        self._av, self._images = package("av", "data sets with videos"), package("PIL.Image", "data sets with videos")
         height, width = shape[:2]
         if height % 2 or width % 2 or min(height, width) < _LEAST:
             raise ConfigurationError(f"videos of {width} x {height}: give even sizes of at least {_LEAST}")

@@ -224,7 +224,7 @@ class JoinedFeature:
 
 def pixels_of(png: bytes) -> npt.NDArray[np.float32]:
     """Return (pixels, 3, 1, 1) float32 of an image, 0 to 1; evenly spaced pixels of a large one."""
-    image_module = package("PIL.Image", "a data set with images")
+    image_module = package("PIL.Image", "data sets with images")
     try:
         with image_module.open(BytesIO(png)) as image:
             pixels = np.asarray(image)

@@ -116,7 +116,7 @@ class SetForm:
 
 def _pngs(image: TouchImage, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """(rows,) PNG files as bytes objects."""
-    pillow = package("PIL.Image", "a data set with images")
+    pillow = package("PIL.Image", "data sets with images")
     files = np.empty(len(values), object)
     for row, of in enumerate(values):
         file = BytesIO()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from skinware.errors import ConfigurationError
+from skinware.errors import MissingExtra
 from skinware_drivers.virtual.device import EmulatorOptions
 from skinware_drivers.virtual.hardware import name_of
 
@@ -24,7 +24,7 @@ def open_world(options: EmulatorOptions, emulator: type) -> PhysicsWorld | None:
     except ModuleNotFoundError as error:
         if error.name != "mujoco":
             raise
-        raise ConfigurationError("option world: MuJoCo is not installed: pip install 'skinware[mujoco]'") from None
+        raise MissingExtra.of("the option world", "skinware[mujoco]") from None
     return PhysicsWorld(
         find_binding(options.world, name_of(emulator)),
         seed=options.seed,

@@ -256,6 +256,8 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
     name = command.name or os.path.basename(sys.argv[0])
     if f"_{name}_COMPLETE".upper().replace("-", "_") in os.environ:
         command.main(list(arguments), prog_name=name)  # the shell asks for completions
+    if logging.lastResort is not None:  # for commands that do not log_to_stderr
+        logging.lastResort.setFormatter(Formatter(f"{name}: %(message)s"))
     try:
         # command.main() makes a closed pipe a failure
         color = False if os.environ.get("NO_COLOR") else None  # None: colours on a terminal

@@ -161,7 +161,7 @@ class PatchNews:
         return change
 
 
-_WINDOW_NS = 5 * NS_PER_S
+_WINDOW_NS = 2 * NS_PER_S
 _STEADILY = 3
 """Windows in a row: what waited while a driver was held up comes in one."""
 _MUCH = 1.6

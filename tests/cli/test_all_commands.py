@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import re
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +28,13 @@ def command_of(name: str) -> click.Command:
 def test_it_tells_its_version(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(command_of(name), ["--version"]) == 0
     assert capsys.readouterr().out == f"{name} {version('skinware')}\n"
+
+
+def test_warnings_begin_with_the_name_of_the_command() -> None:
+    assert exit_status(command_of("skin-record"), ["--version"]) == 0
+    record = logging.LogRecord("skinware", logging.WARNING, "", 0, "cannot be read", None, None)
+    assert logging.lastResort is not None
+    assert logging.lastResort.format(record) == "skin-record: cannot be read"
 
 
 @pytest.mark.parametrize("name", ["skin-config", "skin-import"])

@@ -28,8 +28,9 @@ class Patches:
 
 def test_a_patch_that_sends_twice_as_much_is_reported_once() -> None:
     patches = Patches()
-    assert patches.send(14, 1, 2) == []
-    assert patches.send(60, 1, 2) == [(1, 2.0)]
+    assert patches.send(5, 1, 2) == []
+    assert patches.send(3, 1, 2) == [(1, 2.0)]
+    assert patches.send(60, 1, 2) == []
     assert patches.send(60, 2, 2) == [(0, 2.0)]
 
 

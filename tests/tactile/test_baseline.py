@@ -636,3 +636,22 @@ def test_a_bottle_that_is_emptied_slowly_is_held_to_the_end_and_then_let_go(per_
             seen.append(float(calm.touched[held].mean()))
     assert np.mean(seen) > 0.97
     assert not calm.touched.any()
+
+
+@pytest.mark.parametrize("counts", [-12, 12, 40])
+@pytest.mark.parametrize("gap_s", [0, 10])
+def test_a_supply_that_sags_is_no_touch_and_changes_none(counts: float, gap_s: float) -> None:
+    """All offsets step together and back, in a frame or while none came, and two fingers hold something meanwhile."""
+    random, held = np.random.default_rng(5), np.arange(N) % 12 < 3
+    baseline, gain = Baseline(MODULE, np.zeros(N, int)), 1 + 0.1 * random.standard_normal(N)
+    held &= MODULE < 2
+    for number in range(1000):
+        time_s = number / 20
+        frame_s = time_s + gap_s * (time_s >= 20) + gap_s * (time_s >= 30)
+        values = 60 + 25 * held * (10 < time_s < 40) + counts * gain * (20 <= time_s < 30)
+        calm = baseline.update(round(frame_s * 1e9), np.round(values + 0.8 * random.standard_normal(N)))
+        if time_s > 5.5:
+            assert not calm.touched[~held].any(), f"{time_s} s"
+        if 10.2 < time_s < 39.9:
+            assert calm.touched[held].all(), f"{time_s} s"
+    assert not calm.touched.any()

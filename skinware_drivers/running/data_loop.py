@@ -156,7 +156,9 @@ class Attention:
         self._looked_ns, self._slept_ns = time_ns, slept_ns
         if max(late_ns, asleep_ns) <= _HELD_UP_NS:
             return None
-        if asleep_ns > _HELD_UP_NS:
+        if asleep_ns <= _HELD_UP_NS:  # two clocks are never read at the same moment
+            asleep_ns = 0
+        if asleep_ns:
             log.warning("this machine was suspended for %.1f s: silence is counted from now on", asleep_ns / NS_PER_S)
         elif late_ns > _WORTH_A_LINE_NS:
             log.warning(
@@ -164,12 +166,16 @@ class Attention:
                 " now on",
                 late_ns / NS_PER_S,
             )
-        return since_ns, max(0, asleep_ns)
+        return since_ns, asleep_ns
 
 
 def _slept_ns() -> int:
-    """Return how long the machine has been suspended since it booted."""
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.clock_gettime_ns(time.CLOCK_MONOTONIC)
+    """Return how long the machine has been suspended since it booted, not bent by a pause between two clocks."""
+    reads = []
+    for _ in range(3):
+        before_ns, boot_ns, after_ns = now_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME), now_ns()
+        reads.append((after_ns - before_ns, boot_ns - (before_ns + after_ns) // 2))
+    return min(reads)[1]
 
 
 class DataLoop:

@@ -30,6 +30,9 @@ def test_being_late_is_being_held_up(monkeypatch: pytest.MonkeyPatch, caplog: py
     since_ns, due_ns = clocks.now_ns, clocks.now_ns + 500 * MS
     clocks.now_ns += 5500 * MS
     assert process.look(due_ns) == (since_ns, 0)
+    clocks.now_ns += 5500 * MS
+    clocks.slept_ns += 9_500  # two clocks are never read at the same moment
+    assert process.look(due_ns) == (since_ns + 5500 * MS, 0)
     assert process.look(due_ns) is None  # it was looked at
     assert "held up for 5.0 s" in caplog.text
     assert begun_ns < since_ns

@@ -6,6 +6,7 @@ Their controller's rates and state come by rtnetlink; its error frames and the l
 from __future__ import annotations
 
 import ctypes
+import errno
 import fcntl
 import socket
 import struct
@@ -25,10 +26,10 @@ from skinware_drivers.native.device_time import DeviceClock, Times
 NO_CAN = "this kernel has no CAN: load it (sudo modprobe can-raw), or use a bus that needs none (--bus virtual)"
 
 # linux/rtnetlink.h, linux/if_link.h, linux/can/netlink.h
-_RTM_NEWLINK, _RTM_GETLINK, _NLM_F_REQUEST = 16, 18, 1
+_RTM_NEWLINK, _RTM_GETLINK, _NLM_F_REQUEST, _NLMSG_ERROR = 16, 18, 1, 2
 _IFLA_IFNAME, _IFLA_LINKINFO, _IFLA_INFO_DATA = 3, 18, 2
 _IFLA_CAN_BITTIMING, _IFLA_CAN_STATE, _IFLA_CAN_RESTART_MS, _IFLA_CAN_DATA_BITTIMING = 1, 4, 6, 9
-_HEADER, _INTERFACE = struct.Struct("=IHHII"), struct.Struct("=BxHiII")
+_HEADER, _INTERFACE, _ERROR = struct.Struct("=IHHII"), struct.Struct("=BxHiII"), struct.Struct("=i")
 _ANSWER_BYTES = 1 << 16
 
 
@@ -51,6 +52,22 @@ class Controller:
 
 def read_controller(interface: str) -> Controller | None:
     """Return the controller of an interface; None if it has none (``vcan``) or cannot be asked."""
+    return parse_answer(_ask_for_link(interface))
+
+
+def is_missing(interface: str) -> bool:
+    """Return whether there is no interface of this name; False if the kernel cannot be asked.
+
+    A socket that is bound to a missing one makes the kernel run ``modprobe`` twice, while all buses wait.
+    """
+    answer = _ask_for_link(interface)
+    if len(answer) < _HEADER.size + _ERROR.size or _HEADER.unpack_from(answer)[1] != _NLMSG_ERROR:
+        return False
+    return bool(_ERROR.unpack_from(answer, _HEADER.size)[0] == -errno.ENODEV)
+
+
+def _ask_for_link(interface: str) -> bytes:
+    """Return the kernel's answer; empty if it gives none."""
     name = interface.encode() + b"\0"
     attribute = struct.pack("=HH", 4 + len(name), _IFLA_IFNAME) + name.ljust(-(-len(name) // 4) * 4, b"\0")
     body = _INTERFACE.pack(socket.AF_UNSPEC, 0, 0, 0, 0) + attribute
@@ -59,9 +76,9 @@ def read_controller(interface: str) -> Controller | None:
         with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW | socket.SOCK_CLOEXEC, socket.NETLINK_ROUTE) as netlink:
             netlink.settimeout(1.0)  # it answers within the call
             netlink.send(request)
-            return parse_answer(netlink.recv(_ANSWER_BYTES))
+            return netlink.recv(_ANSWER_BYTES)
     except OSError:
-        return None
+        return b""
 
 
 def parse_answer(answer: bytes) -> Controller | None:

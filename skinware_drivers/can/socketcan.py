@@ -30,6 +30,7 @@ from skinware_drivers.can.receiving import (
     ControllerHealth,
     Stamper,
     has_hardware_stamps,
+    is_missing,
     read_controller,
     rows_of,
     wire_bits,
@@ -126,6 +127,8 @@ class SocketCanBus(KernelBus):
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _ALL_ERRORS)
             if self._filters:
                 _set_filters(sock, self._filters)
+            if is_missing(self.channel):
+                raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
             sock.bind((self.channel,))
             if not _is_up(sock, self.channel):
                 raise BusNotAvailable(

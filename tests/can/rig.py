@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 import socket
 import struct
 import threading
@@ -13,6 +15,7 @@ import numpy as np
 
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can import CanAdapter
+from skinware_drivers.can.receiving import is_missing
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.fields import Identifier
@@ -39,6 +42,8 @@ def can_frame(identifier: int, payload: bytes) -> bytes:
 
 
 def sender(interface: str) -> socket.socket:
+    if is_missing(interface):  # to bind to it would start modprobe, for which all of the lab waits
+        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
     sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
         sock.bind((interface,))

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG
-from skinware_drivers.can.receiving import TROUBLE_LASTS_S, Controller, ControllerHealth, parse_answer, read_controller
+from skinware_drivers.can.receiving import (
+    TROUBLE_LASTS_S,
+    Controller,
+    ControllerHealth,
+    is_missing,
+    parse_answer,
+    read_controller,
+)
 
 # class, bytes 0 to 7, and what is wrong then; from linux/can/error.h and the drivers sja1000, mcp251xfd, dev/dev.c
 FRAMES = {
@@ -154,3 +161,11 @@ def test_a_damaged_message_raises_nothing(noise: bytes, at: int) -> None:
 def test_an_interface_without_a_controller_tells_of_none() -> None:
     assert read_controller("lo") is None
     assert read_controller("no-such-if") is None
+
+
+def test_an_interface_is_known_to_be_missing_without_a_search_for_its_driver() -> None:
+    assert [is_missing(name) for name in ("lo", "no-such-if", "a name that is far too long for any")] == [
+        False,
+        True,
+        False,
+    ]

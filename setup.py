@@ -26,10 +26,8 @@ OPTIONS = ["-O3", "-std=c11", "-fPIC", "-shared", "-fvisibility=hidden"]
 OPTIONS += ["-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"]  # loops over taxels
 OPTIONS += shlex.split(os.environ.get("CFLAGS", ""))
 LINKER = ["-lm", *shlex.split(os.environ.get("LDFLAGS", ""))]
-HEADERS = {
-    "skinware": ["skinware/include", "skinware/native"],
-    "skinware_drivers": ["skinware/include", "skinware/native", "skinware_drivers/native"],
-}
+CORE = ["skinware/include", "skinware/native"]
+HEADERS = {"skinware": CORE, "skinware_drivers": [*CORE, "skinware_drivers/native"]}
 ZIG = [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
 PROBE = "#include <sys/epoll.h>\nint probe(void);\nint probe(void) { return EPOLLIN; }\n"
 MISSING = (

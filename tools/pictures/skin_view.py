@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,24 +99,42 @@ def picture(browser: Browser, shown: Shown, namespace: str) -> Image.Image:
     return done
 
 
-def moving(browser: Browser, recording: Path, file: Path) -> None:
-    """Save what a window shows of a recording, moment by moment: no slow machine is seen in it."""
+def moments(
+    browser: Browser, recording: Path, address: str, size: tuple[int, int], n_drivers: int, first_s: float, n: int
+) -> Iterator[tuple[float, Image.Image]]:
+    """What a window shows of a recording, moment by moment: no slow machine is seen in it.
+
+    Args:
+        recording: of so many drivers.
+        address: its part that says how it is looked at.
+        size: of the window, CSS pixels.
+        first_s: where the first picture is.
+        n: number of pictures, each ``FRAME_MS`` after the one before.
+
+    Yields:
+        (time in the recording, s; picture).
+    """
     with viewing(str(recording)) as (_, url):
-        page = browser.new_page(viewport={"width": MOVING[0], "height": MOVING[1]})
-        page.goto(f"{url}#sharp=1&theme=dark&t=1.0&{BOTH}")
+        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        page.goto(f"{url}#sharp=1&t={first_s}&{address}")
+        last_s = first_s + n * FRAME_MS / 1000
         until(
             page,
-            "window.skin?.drivers.length === 2 && skin.replays[0].paused && skin.outlines[0].until_s > 9",
+            f"window.skin?.drivers.length === {n_drivers} && skin.replays[0].paused"
+            f" && skin.outlines[0].until_s > {last_s}",
             within_ms=PATIENCE_MS,
         )
-        images = []
-        for number in range(FRAMES):
+        for number in range(n):
             drawn = page.evaluate("skin.turn")
             page.keyboard.press("]")
-            time_s = 1.0 + (number + 1) * FRAME_MS / 1000
-            until(page, f"skin.replays[0].time_s > {time_s - 0.05} && skin.turn > {drawn} + 3", within_ms=PATIENCE_MS)
-            images.append(screen(page))
+            time_s = first_s + (number + 1) * FRAME_MS / 1000
+            until(page, f"skin.replays[0].time_s > {time_s - 0.05} && skin.turn > {drawn} + 2", within_ms=PATIENCE_MS)
+            yield time_s, screen(page)
         page.close()
+
+
+def save_moving(images: Sequence[Image.Image], file: Path) -> None:
+    """Save a moving picture of at most ``MOST_BYTES``."""
     for quality in range(80, 10, -10):
         images[0].save(
             file, save_all=True, append_images=images[1:], duration=FRAME_MS, loop=0, quality=quality, method=4
@@ -127,7 +146,8 @@ def moving(browser: Browser, recording: Path, file: Path) -> None:
 def main() -> None:
     folder, own, calm, recording = Path(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
     with chromium() as browser:
-        moving(browser, recording, folder / "view.webp")
+        shown = moments(browser, recording, f"theme=dark&{BOTH}", MOVING, 2, 1.0, FRAMES)
+        save_moving([image for _, image in shown], folder / "view.webp")
         for name, shown in PICTURES.items():
             picture(browser, shown, calm if shown.calm else own).save(folder / f"{name}.png", optimize=True)
     for file in sorted(folder.glob("view*.*")):

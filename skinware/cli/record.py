@@ -106,6 +106,12 @@ def past(text: str) -> float:
     type=past,
     help="Keep only the last TIME (60s, 5min), in memory; saved by Enter, SIGUSR1 and at the end.",
 )
+@click.option(
+    "--viewers",
+    "for_viewers",
+    is_flag=True,
+    help="Record also points, images and states for Foxglove and Lichtblick, 30 times a second.",
+)
 @click.option("--wire", "with_wires", is_flag=True, help="Record also the frames and bytes on the drivers' buses.")
 @click.option("--until-eof", is_flag=True, hidden=True)
 @cli.namespace_option
@@ -117,6 +123,7 @@ def command(
     split_size: int | None,
     max_size: int | None,
     last_s: float | None,
+    for_viewers: bool,
     with_wires: bool,
     until_eof: bool,
     namespace: str | None,
@@ -132,6 +139,7 @@ def command(
 
     Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
     """
+    from skinware.conversion.showing import Viewers
     from skinware.memory.namespace import Namespace, check_name
     from skinware.recording.recorder import Recorder
 
@@ -146,7 +154,8 @@ def command(
     place = Namespace(namespace)
     path = files[0] if files else Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
     target = _target(path, split_size, max_size, last_s)
-    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires)
+    beside = Viewers().messages if for_viewers else None
+    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, renderer=beside)
     report = _Progress(recorder, target, path, as_json)
     keys = on_enter(recorder.save) if last_s is not None else contextlib.nullcontext()
     if until_eof:

@@ -13,7 +13,7 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -31,7 +31,7 @@ from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire import message_of
 from skinware.transfer.codec import CodedColumn, FrameEncoder
 from skinware.transfer.collecting import UNREADABLE, Collector
-from skinware.transfer.generation import disguised
+from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
 
 _CHUNK_NS = NS_PER_S // 4
@@ -107,6 +107,13 @@ class TimeAxis:
         ]
 
 
+Renderer = Callable[[str, Generation, Sample, int], Iterable[tuple[str, str, Schema, bytes]]]
+"""Makes messages for viewers of a service's sample: (topic, encoding, schema, data) of each.
+
+It gets the service, the generation, the sample, and its time of publication, ns since 1970 on the recording's axis.
+"""
+
+
 class Recorder:
     """Records until it is stopped.
 
@@ -114,6 +121,7 @@ class Recorder:
         target: destination of the recording; the recorder completes it.
         with_wires: also record the frames and bytes on the wires of the drivers.
         disguise: replaces names of buses and texts of options; None: they are written as they are.
+        renderer: makes messages for viewers, recorded beside the samples.
     """
 
     def __init__(
@@ -124,11 +132,12 @@ class Recorder:
         namespace: Namespace | str | None = None,
         with_wires: bool = False,
         disguise: Callable[[str], str] | None = None,
+        renderer: Renderer | None = None,
         clocks: Callable[[], Clocks] = read_clocks,
     ) -> None:
         self._target = target
         self._bytes_given = 0
-        self._coder = _Coder(target, disguise, TimeAxis(clocks))
+        self._coder = _Coder(target, disguise, renderer, TimeAxis(clocks))
         self._collector = Collector(Namespace.of(namespace), names, self, with_wires=with_wires)
         self._collector.take()  # later services are recorded from their first sample on
         self._stopping = False
@@ -213,6 +222,7 @@ class Recorder:
 class _Stream:
     head: Head
     encoder: FrameEncoder
+    generation: Generation | None
 
 
 @dataclass(frozen=True)
@@ -229,6 +239,7 @@ class _Coder(threading.Thread):
         self,
         target: Target,
         disguise: Callable[[str], str] | None,
+        renderer: Renderer | None,
         axis: TimeAxis,
     ) -> None:
         super().__init__(name="skinware recorder")
@@ -236,7 +247,7 @@ class _Coder(threading.Thread):
         self.bytes_done = 0
         self.failure: Exception | None = None
         self.jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
-        self._target, self._disguise = target, disguise
+        self._target, self._disguise, self._renderer = target, disguise, renderer
         self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
         self._pending = PendingChunk()
         self._abouts = 0
@@ -281,6 +292,9 @@ class _Coder(threading.Thread):
             self._begin_chunk()
             time_ns, wall_ns = self._axis.log_ns(frame.published_ns), self._axis.wall_ns(frame.published_ns)
             self._pending.add_sample(channel, schema, frame, time_ns, stream.encoder, stream.head, wall_ns)
+            if self._renderer is not None and stream.generation is not None:
+                for topic, encoding, known, data in self._renderer(service, stream.generation, frame, time_ns):
+                    self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
         self.bytes_done += len(frame.slot)
 
     def save(self) -> None:
@@ -309,7 +323,11 @@ class _Coder(threading.Thread):
         channel, schema = self.channels.of_service(service, GENERATION)
         columns = segment.layout.slot
         encoder = FrameEncoder([CodedColumn.of(column) for column in columns])
-        self._streams[service] = _Stream(Head(channel, schema, number, head), encoder)
+        generation = None
+        if self._renderer is not None:
+            with contextlib.suppress(BadRecording):  # viewers cannot show an unreadable driver
+                generation = Generation(head, service)
+        self._streams[service] = _Stream(Head(channel, schema, number, head), encoder, generation)
 
     def _begin_wires(self, service: str, wires: _WireStream) -> None:
         if self._disguise is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,17 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+import skinware.recording
 from skinware import Structure
 from skinware.conversion import Selection, convert, ros_messages
-from skinware.conversion.showing import RATE_HZ
+from skinware.conversion.showing import RATE_HZ, Viewers
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
-from tests.cli.fake_skin import fake_structure
+from skinware.recording.files import Files, recover
+from skinware_drivers.testing.waiting import wait_until
+from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.recording.made import START_NS, MadeTable, made_recording
-from tests.recording.rig import two_drivers_and_a_service
+from tests.recording.rig import recording, two_drivers_and_a_service
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -236,3 +240,26 @@ def test_events_and_states_are_json(tmp_path: Path) -> None:
     assert state["buses"] == [{"name": "can0", "state": "live", "load": 0.0}]
     with pytest.raises(ConfigurationError, match="no driver is in it, and nothing else can be shown"):
         convert(file, tmp_path / "pose.mcap", "foxglove", Selection(["pose"]))
+
+
+def test_they_are_recorded_live_too_beside_all_frames(tmp_path: Path) -> None:
+    file = tmp_path / "live.mcap"
+    with (
+        FakeSkin("torso", placed(fake_structure(1, 2))) as skin,
+        recording(file, Files(file), renderer=Viewers().messages) as recorder,
+    ):
+        for _ in range(60):
+            skin.publish()
+            time.sleep(0.005)
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame") == 60)
+    recover(file, tmp_path / "whole.mcap")
+    for path in (file, tmp_path / "whole.mcap"):
+        with skinware.recording.open(path) as opened:
+            assert (opened.services, opened.problems) == (("torso",), [])
+            series = opened["torso"].read()
+            values = series.physical("pressure")
+        shown = decoded_messages(path, ["/skin/torso/points/pressure"])
+        assert 1 <= len(shown) <= RATE_HZ * (series.time_s[-1] - series.time_s[0]) + 2
+        for _, each in shown:
+            points = points_of(each)
+            assert (points["intensity"] == values).all(axis=1).any()

@@ -1,6 +1,6 @@
 """Recording: what it costs, how large it is, what it loses, and what a killed recorder leaves; as people start it.
 
-tools/bench record [cost|kills|convert|losses] [--seconds S] [--kills N] [--minutes M] [--busy N]
+tools/bench record [cost|kills|convert|losses] [--viewers] [--seconds S] [--kills N] [--minutes M] [--busy N]
                     [--slots N] [--sensors N ...] [--pattern NAME ...] [--formats NAME ...]
 """
 
@@ -203,14 +203,14 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def cost(seconds: float, skins: list[int], patterns: list[str], folder: Path) -> None:
+def cost(seconds: float, skins: list[int], patterns: list[str], folder: Path, *options: str) -> None:
     """Processor time, bytes a frame and losses, by skin and pattern."""
     print(f"{RATE_HZ} Hz, {seconds:g} s each; load {os.getloadavg()[0]:.1f}")
     for sensors in skins:
         for pattern in patterns:
             with own_namespace() as namespace:
                 file = folder / f"{sensors}-{pattern}.mcap"
-                with driving(namespace.name, sensors, pattern), recording(namespace.name, file) as process:
+                with driving(namespace.name, sensors, pattern), recording(namespace.name, file, *options) as process:
                     begin_s, used_s, size = time.monotonic(), cpu_s(process.pid), file.stat().st_size
                     time.sleep(seconds)
                     share = (cpu_s(process.pid) - used_s) / (time.monotonic() - begin_s)
@@ -360,10 +360,12 @@ def main() -> None:
     parser.add_argument("--sensors", type=int, nargs="+", default=[LARGE, SMALL], metavar="N")
     parser.add_argument("--pattern", nargs="+", choices=PATTERNS, default=list(PATTERNS))
     parser.add_argument("--formats", nargs="+", choices=FORMAT_OPTIONS, default=list(FORMAT_OPTIONS), help="of convert")
+    parser.add_argument("--viewers", action="store_true", help="cost of a recorder with --viewers")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if options.what in (None, "cost"):
-            cost(options.seconds, options.sensors, options.pattern, Path(folder))
+            more = ["--viewers"] * options.viewers
+            cost(options.seconds, options.sensors, options.pattern, Path(folder), *more)
         if options.what in (None, "kills"):
             kills(options.kills, options.sensors, Path(folder))
         if options.what in (None, "convert"):

@@ -32,10 +32,10 @@ MOST_MEMORY = 6 << 30
 
 
 def record(driver: str, file: Path) -> None:
-    """Two seconds of a driver on the bus `virtual`, with what goes over it."""
+    """Two seconds of a driver on the bus `virtual`, with what goes over it, and with what viewers show."""
     with running("skin-driver", "--driver", driver, "--bus", "virtual") as source:
         source.wait_for("ready")
-        with running("skin-record", "--wire", "-o", str(file), "-T", "2") as recorder:
+        with running("skin-record", "--wire", "--viewers", "-o", str(file), "-T", "2") as recorder:
             recorder.wait_for("stopped")
 
 

@@ -306,11 +306,7 @@ class SkinTop(App[None]):
         return self._overview.drivers.get(row.key.driver)
 
     def _say(self, where: str, text: str | Text) -> None:
-        line = self._lines[where]
-        if isinstance(text, str):
-            text = printable(text, "\n")
-        else:
-            text.plain = printable(text.plain, "\n")
+        line, text = self._lines[where], _printable(text)
         if line.content != text:
             line.update(text, layout=where not in _FIXED and len(str(line.content)) != len(str(text)))
 
@@ -391,3 +387,10 @@ def _state_of(driver: LiveDriver) -> tuple[object, ...]:
     """Return what rows of a driver are made of; no age of a part changes before that of the driver."""
     frame = driver.frame
     return driver.name, life_of(driver.reader, frame), frame, None if frame is None else age_text(frame.age_ns)
+
+
+def _printable(text: str | Text) -> str | Text:
+    if isinstance(text, str):
+        return printable(text, "\n")
+    text.plain = printable(text.plain, "\n")
+    return text

@@ -15,7 +15,7 @@ from skinware_drivers.fields import Reply
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Guests
 from skinware_drivers.modbus.registers import Image, Read, Wanted
-from skinware_drivers.modbus.unanswered import PROBE, Question, Unanswered
+from skinware_drivers.modbus.unanswered import PROBE, SentQuestion, Unanswered
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.running.guard import Backoff, pauses_of_device
 
@@ -133,7 +133,7 @@ class Master:
         self._line = wire.TcpMessages(counters.framing) if over_tcp else wire.RtuMessages(counters.framing)
         self._commands: deque[Message] = deque()
         self.unanswered = Unanswered(timing.timeout_ns)
-        self._again: Question | None = None
+        self._again: SentQuestion | None = None
         self._free_ns = begun_ns
         if before is not None:
             self.unanswered.inherit(before)
@@ -250,7 +250,7 @@ class Master:
             self._schedule.retries.pop(("read", question.read), None)
             self._take_registers(question, answered.earliest_ns, message, time_ns)
 
-    def _take_registers(self, asked: Question, earliest_ns: int, message: Message, time_ns: int) -> None:
+    def _take_registers(self, asked: SentQuestion, earliest_ns: int, message: Message, time_ns: int) -> None:
         read, cycle_ns = self._schedule.reads[asked.read], self._schedule.cycle_ns
         is_of_cycle = earliest_ns >= cycle_ns
         since_ns = cycle_ns if is_of_cycle else time_ns
@@ -258,7 +258,7 @@ class Master:
         if not is_of_cycle:  # not to be joined with others of this cycle
             self._image.areas[read.area].heard_ns[read.first : read.first + read.count] = earliest_ns
 
-    def _count_late(self, asked: Question, time_ns: int) -> None:
+    def _count_late(self, asked: SentQuestion, time_ns: int) -> None:
         self._counters.polls_late += 1
         if self._counters.polls_late == 1:
             log.warning(
@@ -271,7 +271,7 @@ class Master:
                 2 * (time_ns - asked.asked_ns) / 1e6,
             )
 
-    def _take_exception(self, asked: Question, code: int, time_ns: int) -> None:
+    def _take_exception(self, asked: SentQuestion, code: int, time_ns: int) -> None:
         self._counters.errors += 1
         if code in (wire.BUSY, wire.ACKNOWLEDGE) and asked.tries < _MOST_TRIES:
             self._again, self._free_ns = asked, time_ns + _BUSY_NS
@@ -289,7 +289,7 @@ class Master:
             log.warning("%s: %s: %s%s", self._name, what, wire.exception_text(code), advice)
         retry.begin(time_ns)
 
-    def _give_up(self, asked: Question, time_ns: int) -> None:
+    def _give_up(self, asked: SentQuestion, time_ns: int) -> None:
         self._counters.polls_unanswered += 1
         if asked.read >= 0 or asked.read == PROBE:
             self._schedule.retries["unit", asked.message.unit].begin(time_ns)
@@ -310,7 +310,7 @@ class Master:
         probe = self.unanswered.probe_before(message)
         if probe is None:
             return self._ask(message, read, time_ns, tries)
-        self._again = Question(message, read, time_ns, time_ns, tries)
+        self._again = SentQuestion(message, read, time_ns, time_ns, tries)
         return self._ask(probe, PROBE, time_ns)
 
     def _ask(self, message: Message, read: int, time_ns: int, tries: int = 0) -> bytes:
@@ -319,7 +319,7 @@ class Master:
         if over_tcp:
             self.unanswered.number = self.unanswered.number % 0xFFFF + 1
         message = message._replace(number=self.unanswered.number)
-        self.unanswered.ask(Question(message, read, time_ns, time_ns + self._timing.timeout_ns, tries + 1))
+        self.unanswered.ask(SentQuestion(message, read, time_ns, time_ns + self._timing.timeout_ns, tries + 1))
         self._counters.sent += 1
         return wire.tcp_frame(message) if over_tcp else wire.rtu_frame(message)
 

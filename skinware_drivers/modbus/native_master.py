@@ -14,7 +14,7 @@ import numpy as np
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.master import Master
 from skinware_drivers.modbus.registers import Read
-from skinware_drivers.modbus.unanswered import Question
+from skinware_drivers.modbus.unanswered import SentQuestion
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.native import structs
 from skinware_drivers.serial.checksums import CRC16_MODBUS
@@ -94,7 +94,7 @@ class NativeMaster(Master):
         if asker.open >= 0:
             message = schedule.questions[asker.open]._replace(number=self.unanswered.number if self._over_tcp else 0)
             asked_ns = asker.until_ns - self._timing.timeout_ns
-            self.unanswered.ask(Question(message, asker.open, asked_ns, asker.until_ns, 1))
+            self.unanswered.ask(SentQuestion(message, asker.open, asked_ns, asker.until_ns, 1))
         return self._buffer[: asker.size].tobytes()
 
     def _compile(self, read: Read) -> structs.AskedRead:

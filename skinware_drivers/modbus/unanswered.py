@@ -21,7 +21,7 @@ _MOST_PROBES = 12
 """After so many in a row without a reply, the question itself is asked: some devices may answer no probe."""
 
 
-class Question(NamedTuple):
+class SentQuestion(NamedTuple):
     """A question as it was asked; its timeout is at ``until_ns``."""
 
     message: Message
@@ -39,7 +39,7 @@ class Answered(NamedTuple):
         is_sure: no other registers are meant.
     """
 
-    question: Question
+    question: SentQuestion
     earliest_ns: int
     is_sure: bool
 
@@ -62,8 +62,8 @@ class Unanswered:
     def __init__(self, timeout_ns: int) -> None:
         self._timeout_ns = self._pace_ns = timeout_ns
         self._longest_ns = max(_LONGEST_NS, timeout_ns)
-        self._asked: list[Question] = []
-        self.open: Question | None = None
+        self._asked: list[SentQuestion] = []
+        self.open: SentQuestion | None = None
         self.number = 0
         self.drains = False
         self._probes = 0  # in a row without a reply
@@ -84,7 +84,7 @@ class Unanswered:
         self._keep_pace(before._pace_ns)
         self.number = before.number
 
-    def ask(self, question: Question) -> None:
+    def ask(self, question: SentQuestion) -> None:
         oldest_ns = question.asked_ns - _FORGOTTEN_NS
         self._asked = [*(earlier for earlier in self._asked if earlier.asked_ns > oldest_ns), question]
         self.open = question

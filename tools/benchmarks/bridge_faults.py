@@ -179,7 +179,7 @@ def running(sensors: int, generator: random.Random, mode: str | None) -> Iterato
             command = ["join", "bench", "--connect", f"tcp/127.0.0.1:{proxy.port}", "--into", here.name]
             return [str(BIN / "skin-bridge"), *command, "--mode", mode or "auto", "--json"]
 
-        proxy = SlowLink(port, FASTEST_BITS)
+        proxy = SlowLink(port, FASTEST_BITS, 0.0)
         stack.callback(proxy.close)
         programs: dict[str, Program] = {}
         for name, command in (("driver", driver), ("serve", serve), ("join", join)):

@@ -42,7 +42,7 @@ def scene_time_ns(namespace: str) -> int:
         for sample in truth:
             scene_s = float(sample.column("scene_s")[0])
             if scene_s > ROUND_S and scene_s % ROUND_S > BEFORE_S - FIRST_S:
-                return time.time_ns() - sample.age_ns - round(scene_s * NS_PER_S)
+                return int(time.time_ns() - sample.age_ns - round(scene_s * NS_PER_S))
     raise AssertionError("the loop has no end")
 
 

@@ -146,8 +146,8 @@ def save_moving(images: Sequence[Image.Image], file: Path) -> None:
 def main() -> None:
     folder, own, calm, recording = Path(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
     with chromium() as browser:
-        shown = moments(browser, recording, f"theme=dark&{BOTH}", MOVING, 2, 1.0, FRAMES)
-        save_moving([image for _, image in shown], folder / "view.webp")
+        seen = moments(browser, recording, f"theme=dark&{BOTH}", MOVING, 2, 1.0, FRAMES)
+        save_moving([image for _, image in seen], folder / "view.webp")
         for name, shown in PICTURES.items():
             picture(browser, shown, calm if shown.calm else own).save(folder / f"{name}.png", optimize=True)
     for file in sorted(folder.glob("view*.*")):

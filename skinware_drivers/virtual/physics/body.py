@@ -67,7 +67,7 @@ class PhysicsScene:
         self._feels = np.zeros((len(self.modules), self.model.ngeom), bool)
         for number, module in enumerate(self.modules):
             self._feels[number, module.geoms] = True
-        self._is_covered = self._feels.any(axis=0)
+        self._is_covered: npt.NDArray[np.bool_] = np.logical_or.reduce(self._feels)
         self.actuators = Actuators(bound, self.model, self.data)
         self.joints: list[str] = names_of(self.model, mujoco.mjtObj.mjOBJ_JOINT, self.model.njnt)
         self._touching: list[Touching] | None = None

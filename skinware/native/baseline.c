@@ -193,8 +193,6 @@ void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *
     if (!b->has_time || time_ns < b->time_ns)
         time_ns = b->has_time ? b->time_ns : time_ns;
     passed_s = b->has_time ? (double)(time_ns - b->time_ns) / 1e9 : 0;
-    b->is_slow = fmin(passed_s, b->passed_s) >= QUICK_S;
-    b->passed_s = passed_s;
     b->time_ns = time_ns;
     b->has_time = 1;
     take_in(b, values, usable, jumped, passed_s);
@@ -205,7 +203,6 @@ void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *
         for (i = 0; i < b->n; i++)
             b->live[i] = b->ready[i] & b->at_end[i];
     }
-    predict_modes(b, passed_s);
     compare(b);
     smoothing = b->smooth_s > 0 ? passed_share(passed_s, b->smooth_s) : 1;
     rustle_share = (float)fmax(0.5, sqrt(smoothing / (2 - smoothing)));

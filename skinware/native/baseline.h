@@ -43,7 +43,6 @@
 #define LEAST_GAIN 0.1f       /* with less, something else moves the taxel */
 #define MOST_GAIN 3.0f        /* with more, too */
 #define FEW_TAXELS 3.0        /* free taxels of a patch of which nothing is common */
-#define MANY_TAXELS 20.0      /* free taxels of a patch that one touch does not cover evenly */
 #define MATCH_S 2.0           /* seconds in which the agility of the common mode changes e-fold until it explains moves */
 #define RATE_S 30.0           /* seconds over which the speed of the common drift is averaged */
 #define SLOW_S 5.0            /* seconds: deviations that last longer are drift of the taxel, quicker ones are noise */
@@ -64,8 +63,6 @@
 #define STEP_OVER_ON 3.0f     /* thresholds: a module whose taxels all rise alike by less moved its own baseline */
 #define ALIKE 0.3f            /* share of the median: taxels that are nearer to it moved alike */
 #define MOST_ALIKE 0.5        /* share of the taxels of a module that have to */
-#define NEARLY_ALL 0.85       /* share of the free taxels of a patch that have to, where it jumps as a whole */
-#define ALONG 0.25f           /* the same as ALIKE, for a patch: hands press less evenly than that */
 #define AT_ONCE 0.25          /* share of a rise that may come after its first frame: what rises farther is pressed */
 #define SAG_RETURNS_S 0.6f    /* seconds from the end of a contact until the cover around it is back */
 #define SAG_RETURNS_BY 1.5f   /* times the sag: a value that rises farther (and a threshold) is a touch */
@@ -93,8 +90,7 @@ struct patch {
     double moves2;    /* by how much the mode moves from frame to frame, squared, as measured at rest */
     double common;    /* the mode while the rest is measured */
     double move, sure; /* by how much the mode moves with this frame, and how much of that is sure */
-    double sums[6];   /* of this frame */
-    double jump, onset, along, sudden, apart2; /* of a patch that may jump, over its free taxels */
+    double sums[4];   /* of this frame */
 };
 
 struct module {
@@ -121,9 +117,8 @@ struct baseline {
     int64_t *patch, *module;
 
     int64_t time_ns, has_time, few_levels, is_near, all_ready;
-    int64_t is_slow; /* frames come so rarely that one high value is a touch; after one gap it is not */
     int64_t doubts; /* 1: a touch seems to lower some of them in the newest frame */
-    double tick_s, refused_share, passed_s; /* passed_s: before the last frame */
+    double tick_s, refused_share;
     int64_t block_ns, block_frames, n_blocks; /* the tenth that is being measured, and how many are over */
 
     float *level, *gain, *variance, *cross, *gain_variance, *noise2; /* offset, its gain, and how uncertain both are */
@@ -176,7 +171,6 @@ float least_noise2(const struct baseline *b, float level);
 void put(struct baseline *b, int64_t taxel, float by);
 
 /* offsets.c */
-void predict_modes(struct baseline *b, double passed_s);
 void follow_common(struct baseline *b, double passed_s);
 void learn(struct baseline *b, float rustle_share, double passed_s);
 

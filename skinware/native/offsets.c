@@ -9,16 +9,7 @@
 #define MEDIAN2 0.455 /* median of the square of a standard normal deviate */
 #define LEAST 1e-30   /* keeps divisors above 0 */
 
-enum { WEIGHT, REACH, FOUND, FREE, LIVE, OUT, SUMS };
-
-/* Lets the modes become less certain by their drift, for as long as it has not been seen. */
-void predict_modes(struct baseline *b, double passed_s) {
-    int64_t i;
-    for (i = 0; i < b->n_patches && !b->has_no_common; i++) {
-        struct patch *p = &b->patches[i];
-        p->variance += p->rate2 * (2 * p->unknown_s + passed_s) * passed_s;
-    }
-}
+enum { WEIGHT, REACH, FOUND, FREE };
 
 static void step_mode(struct patch *p, double passed_s) {
     const double weights = fmax(p->sums[WEIGHT], LEAST);
@@ -30,7 +21,12 @@ static void step_mode(struct patch *p, double passed_s) {
     const double trust = is_known ? 1 - FEW_TAXELS / p->sums[FREE] : 0;
     double total, most, share, news;
     p->variance += p->agility * passed_s;
-    p->unknown_s = is_known ? 0 : p->unknown_s + passed_s;
+    if (is_known) {
+        p->unknown_s = 0;
+    } else {
+        p->variance += p->rate2 * (2 * p->unknown_s + passed_s) * passed_s;
+        p->unknown_s += passed_s;
+    }
     total = p->variance + 1 / precision;
     most = (double)DRIFT_SIGMA * sqrt(total);
     share = trust * p->variance / total;
@@ -54,7 +50,7 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
     const float common = (float)p->variance, typical = (float)p->noise2, low = -(float)b->off_sigma;
     double weights = p->sums[WEIGHT], reach = p->sums[REACH], found = p->sums[FOUND], number = p->sums[FREE];
     const int64_t first = run->first, last = run->last;
-    int64_t i, live = 0, out = 0;
+    int64_t i;
     INDEPENDENT
     for (i = first; i < last; i++) {
         const float lowest_rest = low * sqrtf(a.noise2[i]), since_s = a.since_end_s[i];
@@ -78,80 +74,8 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
         reach += (double)(a.scratch[i] * a.gain[i]);
         found += (double)a.scratch[a.n + i];
         number += a.flag[i];
-        live += a.live[i];
-        out += a.flag[i] & (fabsf(a.deviation[i]) > a.on[i]);
     }
-    p->sums[LIVE] += (double)live, p->sums[OUT] += (double)out;
     p->sums[WEIGHT] = weights, p->sums[REACH] = reach, p->sums[FOUND] = found, p->sums[FREE] = number;
-}
-
-static int may_jump(const struct patch *p) {
-    const double *sums = p->sums;
-    return sums[FREE] > MANY_TAXELS && 2 * sums[FREE] >= sums[LIVE] && sums[OUT] >= NEARLY_ALL * sums[FREE];
-}
-
-/* Whether a taxel moved as far as the typical free one of its patch. */
-static int moved_along(const struct baseline *b, int64_t i) {
-    const float jump = (float)b->patches[b->patch[i]].jump;
-    return fabsf(b->deviation[i] - jump) < highest(ALONG * fabsf(jump), 0.5f * b->on[i]);
-}
-
-/*
- * Finds the patches whose mode jumps, b->flag says which taxels are free: nearly all of them moved alike, in one frame, as no
- * load does. It jumps where a supply sags, or a gap hid a move.
- */
-static int64_t find_jumps(struct baseline *b, double passed_s) {
-    const int64_t stride = sizeof(struct patch) / sizeof(double);
-    int64_t i, k, found = 0;
-    for (k = 0; k < b->n_patches; k++)
-        found += may_jump(&b->patches[k]);
-    if (!found || b->is_signed)
-        return 0;
-    medians(b, b->patch, b->n_patches, b->deviation, b->flag, &b->patches->jump, stride);
-    for (k = 0; k < b->n_patches; k++)
-        b->patches[k].along = b->patches[k].sudden = b->patches[k].apart2 = 0;
-    for (i = 0; i < b->n; i++) {
-        struct patch *p = &b->patches[b->patch[i]];
-        const double apart = (double)b->deviation[i] - p->jump;
-        const int is_sudden = p->jump > 0 ? b->high[i] : (double)b->smooth[i] > AT_ONCE * p->jump;
-        if (b->flag[i] && moved_along(b, i))
-            p->along += 1, p->apart2 += apart * apart;
-        b->flag[i] &= is_sudden;
-        p->sudden += b->flag[i];
-    }
-    medians(b, b->patch, b->n_patches, b->onset, b->flag, &b->patches->onset, stride);
-    for (k = found = 0; k < b->n_patches; k++) {
-        struct patch *p = &b->patches[k];
-        const double most = NEARLY_ALL * p->sums[FREE], late = fabs(p->onset - p->jump);
-        const int is_at_once = p->sudden >= most && (p->jump < 0 || late < AT_ONCE * p->jump);
-        const double far2 = b->on_sigma * b->on_sigma * (p->variance + p->agility * passed_s); /* else it follows a hum */
-        if (!may_jump(p) || p->along < most || p->jump * p->jump < far2 || !is_at_once)
-            p->jump = 0;
-        found += p->jump != 0;
-    }
-    return found;
-}
-
-/* Moves the offsets of patches whose mode jumps: those of free taxels to their values, others as far as is typical. */
-static void follow_jumps(struct baseline *b, double passed_s) {
-    const float on_sigma = (float)b->on_sigma;
-    int64_t i;
-    if (!find_jumps(b, passed_s))
-        return;
-    for (i = 0; i < b->n; i++) {
-        struct patch *p = &b->patches[b->patch[i]];
-        const float variance = b->variance[i], apart2 = (float)(p->apart2 / fmax(p->along, 1));
-        const int is_free = !b->touched[i] && !b->at_end[i] && moved_along(b, i);
-        if (p->jump == 0 || !b->live[i])
-            continue;
-        p->sums[FREE] = 0; /* they say no more in this frame */
-        put(b, i, is_free ? b->deviation[i] : (float)p->jump);
-        b->smooth[i] = b->deviation[i];
-        if (is_free)
-            continue;
-        b->variance[i] = variance + apart2;
-        b->on[i] = sqrtf(b->on[i] * b->on[i] + on_sigma * on_sigma * apart2);
-    }
 }
 
 /* Moves the offsets by the common mode, and takes that off the deviations. */
@@ -161,11 +85,10 @@ void follow_common(struct baseline *b, double passed_s) {
     if (passed_s <= 0 || b->has_no_common)
         return;
     for (number = 0; number < b->n_patches; number++)
-        for (i = 0; i < SUMS; i++)
+        for (i = 0; i < 4; i++)
             b->patches[number].sums[i] = 0;
     for (number = 0; number < b->n_runs; number++)
         sum_run(b, &b->runs[number], &b->patches[b->runs[number].patch]);
-    follow_jumps(b, passed_s);
     for (number = 0; number < b->n_patches; number++)
         step_mode(&b->patches[number], passed_s);
     for (number = 0; number < b->n_runs; number++) {

@@ -88,7 +88,7 @@ static int64_t judge(struct baseline *b, double passed_s) {
         a.high[i] = a.live[i] ? (uint8_t)high : a.high[i];
         if (high && !was_high)
             a.onset[i] = a.deviation[i];
-        if (high && !a.touched[i] && (was_high || b->is_slow) &&
+        if (high && !a.touched[i] && (was_high || passed_s >= QUICK_S) &&
             load_of(&a, a.smooth[i]) > (a.bears[i] ? a.off[i] : a.on[i]))
             begin_touch(b, i, load_of(&a, a.smooth[i]));
         if (a.touched[i])

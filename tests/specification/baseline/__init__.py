@@ -29,13 +29,9 @@ from skinware.status import Why
 from skinware.tactile.baseline import BaselineSettings, Calm
 from tests.specification.baseline.numbers import (
     ALIKE,
-    ALONG,
-    AT_ONCE,
     EPSILON,
     FEW_LEVELS,
     FORGET_AFTER_S,
-    MANY_TAXELS,
-    NEARLY_ALL,
     OFF_TO_ON,
     RESETTLE_S,
     STEPS_OF_A_TOUCH,
@@ -228,7 +224,6 @@ class SpecifiedBaseline:
         if not self._ready.all():
             self._measure(time_ns, usable, passed_s)
         live = usable & self._ready
-        offsets.common.predict(passed_s)
         deviation = np.where(live, intake.last - offsets.level - touches.remainders.left, np.float32(0))
         free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end()
         spread = np.sqrt(offsets.noise2)
@@ -237,7 +232,6 @@ class SpecifiedBaseline:
             free &= ~self._falls.sagging & ~(self._falls.below & low)
         on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
         off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
-        free &= ~self._jump(deviation, live, free, on, passed_s)
         offsets.follow_common(deviation, free, np.where(self._surroundings.held, on * on, np.float32(0)), passed_s)
         touches.follow(deviation, live, on, passed_s, settings.smooth_s)
         rustle = np.float32(touches.noise_share) * off
@@ -306,37 +300,6 @@ class SpecifiedBaseline:
             self._offsets.common.agility[:] = np.maximum(self._rest.moves2 - rounding, 0.01 * rounding) / max(
                 passed_s, 1e-3
             )
-
-    def _jump(self, deviation: Floats, live: Flags, free: Flags, on: Floats, passed_s: float) -> Flags:
-        """Move the offsets of patches of which nearly all free taxels moved alike, in one frame; return (n,) which."""
-        offsets, touches, common = self._offsets, self._touches, self._offsets.common
-        patches = offsets.patches
-        number = patches.sum(free)
-        may = (number > MANY_TAXELS) & (2 * number >= patches.sum(live))
-        may &= patches.sum(free & (np.abs(deviation) > on)) >= NEARLY_ALL * number
-        if not may.any() or touches.signed or passed_s <= 0:
-            return np.zeros_like(live)
-        jump = patches.median(deviation, free)
-        by = np.broadcast_to(patches.spread(jump), deviation.shape)
-        along = np.abs(deviation - by) < np.maximum(np.float32(ALONG) * np.abs(by), np.float32(0.5) * on)
-        n_along = patches.sum(free & along)
-        apart2 = patches.sum(np.where(free & along, (deviation - by).astype(np.float64) ** 2, 0))
-        sudden = free & np.where(by > 0, touches.high, touches.smooth > AT_ONCE * by)
-        late, most = np.abs(patches.median(touches.onset, sudden) - jump), NEARLY_ALL * number
-        at_once = (patches.sum(sudden) >= most) & ((jump < 0) | (late < AT_ONCE * jump))
-        far2 = self._settings.on_sigma**2 * (common.variance + common.agility * passed_s)
-        may &= (n_along >= most) & (jump.astype(np.float64) ** 2 >= far2) & at_once
-        moves = live & may[patches.group]
-        own = ~touches.touched & ~self._at_end() & along
-        others, rows = np.flatnonzero(moves & ~own), np.flatnonzero(moves)
-        variance = (
-            offsets.variance[others] + (apart2 / np.maximum(n_along, 1)).astype(np.float32)[patches.group[others]]
-        )
-        on[others] = np.hypot(on[others], self._settings.on_sigma * np.sqrt(variance - offsets.variance[others]))
-        self._put(rows, np.where(own, deviation, by)[rows], deviation)
-        offsets.variance[others] = variance
-        touches.smooth[rows] = deviation[rows]
-        return moves
 
     def _let_go(self, over: Rows, live: Flags, on: Floats, off: Floats, deviation: Floats, passed_s: float) -> None:
         """End touches: what is left of them is what the prediction was wrong by."""

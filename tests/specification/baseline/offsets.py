@@ -91,10 +91,6 @@ class CommonMode:
         self.variance, self.agility, self.rate, self.rate2, self.unknown_s = (np.zeros(n_patches) for _ in range(5))
         self.known_s = np.zeros(n_patches)
 
-    def predict(self, passed_s: float) -> None:
-        """Let the modes become less certain by their drift, for as long as it has not been seen."""
-        self.variance += self.rate2 * (2 * self.unknown_s + passed_s) * passed_s
-
     def step(self, found: Doubles, precision: Doubles, free: Doubles, passed_s: float) -> tuple[Doubles, Doubles]:
         """Return (p,) by how much the mode moves, and how much of that is sure enough to learn gains from.
 
@@ -109,7 +105,11 @@ class CommonMode:
         found = found - ahead
         trust = np.where(known, 1 - FEW_TAXELS / np.maximum(free, 1), 0)
         self.variance += self.agility * passed_s
-        self.unknown_s = np.where(known, 0, self.unknown_s + passed_s)
+        unknown = ~known
+        if unknown.any():
+            self.variance[unknown] += self.rate2[unknown] * (2 * self.unknown_s[unknown] + passed_s) * passed_s
+            self.unknown_s[unknown] += passed_s
+        self.unknown_s[known] = 0
         total = self.variance + 1 / np.maximum(precision, 1e-30)
         most = DRIFT_SIGMA * np.sqrt(total)
         share = trust * self.variance / total

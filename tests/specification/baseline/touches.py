@@ -41,7 +41,6 @@ class Touches:
         smooth: (n,) float32, deviation from the offset, smoothed.
         peak: (n,) float32, the highest load of the touch, slowly followed.
         contact_s: (n,) float32, how long each has been touched.
-        high: (n,) bool, above the threshold at which a touch ends.
         onset: (n,) float32, deviation in the first frame above the threshold at which a touch ends.
         noise_share: share of the noise that smoothing leaves; at least a half.
         remainders: what covers keep of loads.
@@ -51,10 +50,10 @@ class Touches:
         n = len(module)
         self.signed = signed
         self.touched: Flags = np.zeros(n, bool)
-        self.high: Flags = np.zeros(n, bool)
+        self._high: Flags = np.zeros(n, bool)
         self.smooth, self.peak, self.contact_s, self.onset = (np.zeros(n, np.float32) for _ in range(4))
         self._modules, self._patch = Grouping(module), patch
-        self.noise_share, self._passed_s = 0.5, 0.0
+        self.noise_share = 0.5
         self.remainders = Remainders(self._modules, patch)
 
     def load(self, deviation: Floats) -> Floats:
@@ -90,11 +89,10 @@ class Touches:
         smooth, now = self.load(self.smooth), self.load(deviation)
         high = (now > off) & live
         begins = high & (smooth > on) & ~self.touched
-        if min(passed_s, self._passed_s) < QUICK_S:
-            begins &= self.high
-        self._passed_s = passed_s
-        np.copyto(self.onset, deviation, where=high & ~self.high)
-        np.copyto(self.high, high, where=live)
+        if passed_s < QUICK_S:
+            begins &= self._high
+        np.copyto(self.onset, deviation, where=high & ~self._high)
+        np.copyto(self._high, high, where=live)
         begun = np.flatnonzero(begins)
         if len(begun):
             self.touched[begun] = True
@@ -142,7 +140,7 @@ class Touches:
         is_later[modules.group[later]] = True
         here = live & looked[modules.group] & (~self.touched | (self.contact_s < 2 * LOOK_AT_S))
         median = modules.median(deviation, here)
-        onset = modules.median(self.onset, here & self.high)
+        onset = modules.median(self.onset, here & self._high)
         at_once = np.abs(onset - median) < AT_ONCE * median
         at_once &= is_later | (onset > modules.median(on, here))
         sudden = modules.median(offsets.slow, here) < 0.3 * median

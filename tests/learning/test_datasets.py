@@ -80,9 +80,9 @@ def test_tensors_share_the_memory_of_arrays(tmp_path: Path) -> None:
         import torch
         import torch.utils.data
     except ImportError:
-        with pytest.raises(MissingExtra, match="pip install torch"):
+        with pytest.raises(MissingExtra, match="pip install 'torch'"):
             torch_dataset(windows)
-        with pytest.raises(MissingExtra, match="pip install torch"):
+        with pytest.raises(MissingExtra, match="pip install 'torch'"):
             torch_iterable(stream)
         return
     dataset = torch_dataset(windows)

@@ -70,6 +70,7 @@ def interface_flags(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     for name in ("AF_CAN", "CAN_RAW"):
         monkeypatch.setattr(socket, name, getattr(socket, name, 29), raising=False)
     monkeypatch.setattr(socket, "socket", make)
+    monkeypatch.setattr(socketcan, "is_missing", lambda _interface: False)
     monkeypatch.setattr(fcntl, "ioctl", lambda *_: struct.pack("16sH14x", b"can0", flags[0]))
     return flags
 

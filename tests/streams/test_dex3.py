@@ -19,11 +19,11 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from skinware import DriverReader, DriverSnapshot, Namespace
-from skinware.errors import ConfigurationError
+from skinware.errors import ConfigurationError, MissingExtra
 from skinware.status import BusState, Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.registry import make_bus
-from skinware_drivers.streams import bus as stream_bus
+from skinware_drivers.streams import dds
 from skinware_drivers.streams.dds import DdsBus, record, samples
 from skinware_drivers.streams.dex3 import Dex3Driver, Dex3Options
 from skinware_drivers.testing.driving import emulated_skin
@@ -266,8 +266,8 @@ def test_wrong_names(name: str) -> None:
 
 
 def test_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stream_bus, "find_spec", lambda _name: None)
-    with pytest.raises(ConfigurationError, match=r"pip install 'skinware\[ros2\]'"):
+    monkeypatch.setattr(dds, "find_spec", lambda _name: None)
+    with pytest.raises(MissingExtra, match=r"pip install 'skinware\[ros2\]'"):
         make_bus("dds://0")
 
 

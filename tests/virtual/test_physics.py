@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="needs the extra mujoco")
 
-from skinware.errors import ConfigurationError
+from skinware.errors import ConfigurationError, MissingExtra
 from skinware.geometry import GeometryGroup, geometry_to_toml, read_geometry
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.physics.binding import find_binding
@@ -267,5 +267,5 @@ def test_without_mujoco_the_option_says_what_to_install(monkeypatch: pytest.Monk
     for name in [name for name in sys.modules if name.startswith("skinware_drivers.virtual.physics.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ConfigurationError, match=r"pip install 'skinware\[mujoco\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install 'skinware\[mujoco\]'"):
         EmulatedXela(EmulatedXelaOptions(world="mujoco:pad"))

@@ -17,7 +17,7 @@ from skinware_drivers.testing.waiting import wait_until
 SHORT_S = 0.4
 _RUNS = 12
 _HELD_UP_NS = 100_000_000
-"""From such a wait on, the package itself counts silence anew."""
+"""From such a wait on, the package itself counts silence from zero."""
 
 
 def looked(seconds: float = SHORT_S) -> Evidence:

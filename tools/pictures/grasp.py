@@ -28,7 +28,7 @@ from tests.browser.chromium import chromium
 
 PAGE, SCENE = (960, 600), (400, 600)
 WIDTH = 1100
-"""Of the moving picture, pixels."""
+"""Width of the moving picture, pixels."""
 FRAMES = 37
 ROUND_S, BEFORE_S = 16.0, 7.4
 """The hand closes 8 s after the beginning of each round, and opens after 13 s."""

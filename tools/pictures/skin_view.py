@@ -102,7 +102,7 @@ def picture(browser: Browser, shown: Shown, namespace: str) -> Image.Image:
 def moments(
     browser: Browser, recording: Path, address: str, size: tuple[int, int], n_drivers: int, first_s: float, n: int
 ) -> Iterator[tuple[float, Image.Image]]:
-    """What a window shows of a recording, moment by moment: no slow machine is seen in it.
+    """Yield pictures of a window that shows a recording, moment by moment: no slow machine is seen in them.
 
     Args:
         recording: of so many drivers.

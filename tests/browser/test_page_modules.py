@@ -453,3 +453,20 @@ def test_shear_lies_in_the_skin(tell: Callable[..., Any]) -> None:
             assert sum(x * x for x in one) == pytest.approx(1)
             assert sum(x * n for x, n in zip(one, normal, strict=True)) == pytest.approx(0)
         assert sum(x * y for x, y in zip(first, second, strict=True)) == pytest.approx(0)
+
+
+NUMBERED = """(() => {
+    const stage = { width: 400, height: 200, pixels: 40, sheets: [] };
+    stage.camera = { position: { toArray: () => [0, 0, 9] } };
+    stage.project = (x, y) => [x, y, 1];
+    const overlay = new m.Overlay(document.body), written = [];
+    overlay.context.fillText = (text) => written.push(text);
+    overlay.draw(stage, { theme: "dark", names: [], pins: [], hovered: null, contacts: a[0] });
+    return written;
+})()"""
+
+
+def test_the_largest_contacts_have_numbers_and_none_covers_another(tell: Callable[..., Any]) -> None:
+    places = [(7, 100, 3), (23, 108, 9), (38, 104, 1), (41, 200, 2)]
+    contacts = [{"id": number, "at": [x, 50, 0], "load": load} for number, x, load in places]
+    assert tell("overlay.js", NUMBERED, contacts) == ["23", "41"]

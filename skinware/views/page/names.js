@@ -172,11 +172,11 @@ function groups(items, keyOf) {
   return found;
 }
 
-function areOver(one, other) {
+export function areOver(one, other) {
   return Math.abs(one.y - other.y) < LINE && Math.abs(one.x - other.x) < (one.width + other.width) / 2 + 4;
 }
 
-function widthOf(text) {
+export function widthOf(text) {
   if (!widths.has(text)) {
     if (widths.size > 10_000) widths.clear();
     ruler.font = FONT;

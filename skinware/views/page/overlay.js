@@ -1,7 +1,7 @@
 // Draw over the taxels: normals, shear, contacts, names of parts, and rings around chosen taxels.
 
 import { isCurrent } from "./marks.js";
-import { FONT } from "./names.js";
+import { areOver, FONT, widthOf } from "./names.js";
 import { GROUND, INK } from "./palette.js";
 
 const MOST_ARROWS = 8000;
@@ -39,7 +39,8 @@ export class Overlay {
       if (sheet.shown.shear) this.#shear(stage, sheet);
     }
     for (const name of what.names) this.#name(name);
-    for (const contact of what.contacts) this.#contact(stage, contact);
+    const numbers = []; // of the largest; those that would cover them are left out
+    for (const contact of [...what.contacts].sort((a, b) => b.load - a.load)) this.#contact(stage, contact, numbers);
     for (const { sheet, i, letter } of what.pins) this.#ring(stage, sheet, i, letter);
     if (what.hovered) this.#ring(stage, what.hovered.sheet, what.hovered.i, "");
   }
@@ -80,7 +81,7 @@ export class Overlay {
     this.#stroke(1.6);
   }
 
-  #contact(stage, contact) {
+  #contact(stage, contact, numbers) {
     const at = contact.at;
     const [x, y, depth] = stage.project(...at);
     if (depth <= 0) return;
@@ -99,7 +100,12 @@ export class Overlay {
       arrow(context, x, y, nx, ny);
       this.#stroke(2);
     }
-    this.#tag(String(contact.id), x + 0.72 * size + 8, y - 0.72 * size - 8);
+    const text = String(contact.id);
+    const number = { text, width: widthOf(text) + 10, x: x + 0.72 * size + 8, y: y - 0.72 * size - 8 };
+    if (!numbers.some((other) => areOver(number, other))) {
+      numbers.push(number);
+      this.#tag(text, number.x, number.y);
+    }
     context.globalAlpha = 1;
   }
 

@@ -237,7 +237,8 @@ class Master:
         if line.open is None:
             self._free_ns = time_ns + self._timing.turnaround_ns
         if question is not asked:
-            self._count_late(question, time_ns)
+            if time_ns > question.until_ns:  # else its schedule has ended
+                self._count_late(question, time_ns)
             if question.read >= 0 and time_ns - question.until_ns <= _OLD_NS and not wire.exception_of(message.data):
                 self._take_registers(question, answered.earliest_ns, message, time_ns)
         elif question.read == _GUEST:
@@ -252,6 +253,7 @@ class Master:
 
     def _take_registers(self, asked: SentQuestion, earliest_ns: int, message: Message, time_ns: int) -> None:
         read, cycle_ns = self._schedule.reads[asked.read], self._schedule.cycle_ns
+        time_ns = min(time_ns, asked.until_ns)  # the time of a value is at most a timeout after the value
         is_of_cycle = earliest_ns >= cycle_ns
         since_ns = cycle_ns if is_of_cycle else time_ns
         self.rows += self._image.put(read.area, read.first, message.data[2:], time_ns, since_ns)

@@ -173,7 +173,8 @@ def _slept_ns() -> int:
     """Return how long the machine has been suspended since it booted, not bent by a pause between two clocks."""
     reads = []
     for _ in range(3):
-        before_ns, boot_ns, after_ns = now_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME), now_ns()
+        before_ns, boot_ns = time.monotonic_ns(), time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        after_ns = time.monotonic_ns()
         reads.append((after_ns - before_ns, boot_ns - (before_ns + after_ns) // 2))
     return min(reads)[1]
 

@@ -158,6 +158,10 @@ class Emulator(Stage[OptionsT]):
             self.stop(device)
             self.start(device, now_ns, period_s)
 
+    def pressed(self, added: npt.NDArray[np.float64]) -> list[int]:
+        """Return the values of a device whose sensors physics presses by so many counts."""
+        return self._in_range(each_value("rest", self.rest, len(added)) + np.rint(added).astype(np.int64))
+
     def burst(self, device: Device, time_ns: int) -> None:
         """Send the values that are felt now; faults happen here."""
         device.sampled_ns = time_ns
@@ -188,18 +192,19 @@ class Emulator(Stage[OptionsT]):
             return list(self._source(device.number, device.cycle))
         if self.options.pattern == "cycle":
             return [device.cycle % (int(self._each("full_scale").min()) + 1)] * self._n_values
-        values = self._each("rest")
         from_ns = device.ready_ns if device.streams_from_ns is None else device.streams_from_ns
         touched_s = (time_ns - from_ns) * 1e-9 - self.options.calm_s
         if self.options.pattern == "touch" and touched_s >= 0:
             if self.world is None:
-                felt = self.feel(device, touched_s)
-            else:
-                added = self.world.added(device.number, time_ns, self._n_values)
-                felt = (values + np.rint(added).astype(np.int64)).tolist()
-            values = np.clip(felt, self._each("lowest"), self._each("full_scale"))
-        listed: list[int] = values.tolist()
+                return self._in_range(self.feel(device, touched_s))
+            return self.pressed(self.world.added(device.number, time_ns, self._n_values))
+        listed: list[int] = self._each("rest").tolist()
         return listed
+
+    def _in_range(self, felt: Sequence[int] | npt.NDArray[np.int64]) -> list[int]:
+        limits = (each_value(name, getattr(self, name), len(felt)) for name in ("lowest", "full_scale"))
+        values: list[int] = np.clip(felt, *limits).tolist()
+        return values
 
     def _each(self, name: str) -> npt.NDArray[np.int64]:
         return each_value(name, getattr(self, name), self._n_values)

@@ -31,16 +31,20 @@ class Actuators:
     def __init__(self, bound: Bound, model: Any, data: Any) -> None:
         self.names: list[str] = names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
         self.poses: Mapping[str, Mapping[str, float]] = bound.binding.pose
-        self.commanded_s = math.nan
         self._data = data
         self._moves, self._repeat_s = bound.binding.move, bound.binding.repeat_s
-        self._next_move = self._round = 0
         self._ramps: dict[int, tuple[float, float, float, float]] = {}  # actuator -> begin, end, from, to
+        self.reset()
         for name, pose in self.poses.items():
-            self._check(pose, f"{bound.file}: pose {name!r}")
+            self.check(pose, f"{bound.file}: pose {name!r}")
+
+    def reset(self) -> None:
+        self.commanded_s = math.nan
+        self._next_move = self._round = 0
+        self._ramps.clear()
 
     def move(self, targets: Mapping[str, float], seconds: float = 0.0) -> None:
-        self._check(targets, "move")
+        self.check(targets, "move")
         if not 0 <= seconds <= 3600:
             raise ConfigurationError(f"move: {seconds} s: give 0 to 3600")
         now_s = float(self._data.time)
@@ -71,7 +75,7 @@ class Actuators:
                 self._next_move = 0
                 self._round += 1
 
-    def _check(self, targets: Mapping[str, Any], where: str) -> None:
+    def check(self, targets: Mapping[str, Any], where: str) -> None:
         for name, target in targets.items():
             if name not in self.names:
                 raise ConfigurationError(f"{where}: there is no actuator {name!r}; there are {', '.join(self.names)}")

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from skinware.errors import ConfigurationError
+from skinware.errors import ConfigurationError, PlatformError
 from skinware_drivers.virtual.physics.actuators import Actuators, names_of
 from skinware_drivers.virtual.physics.binding import Bound
 from skinware_drivers.virtual.physics.taxels import BoundTaxels, add_sensors, place, place_sensors
@@ -70,10 +70,22 @@ class PhysicsScene:
         self._is_covered: npt.NDArray[np.bool_] = np.logical_or.reduce(self._feels)
         self.actuators = Actuators(bound, self.model, self.data)
         self.joints: list[str] = names_of(self.model, mujoco.mjtObj.mjOBJ_JOINT, self.model.njnt)
-        self._touching: list[Touching] | None = None
-        self.touched_s = math.nan
+        self._renderer: Any = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin at 0 s: the first key frame of the scene, or else its zero."""
         if self.model.nkey:
             mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        else:
+            mujoco.mj_resetData(self.model, self.data)
+        self.actuators.reset()
+        self.touched_s = math.nan
+        self.settle()
+
+    def settle(self) -> None:
+        """Let MuJoCo compute everything that follows from changed positions."""
+        self._touching: list[Touching] | None = None
         mujoco.mj_forward(self.model, self.data)
 
     @property
@@ -120,6 +132,27 @@ class PhysicsScene:
         for number, touches in by_module.items():
             forces[number] = spread(self.modules[number], self.raw(number)[0], touches)
         return forces
+
+    def picture(self, width: int, height: int) -> npt.NDArray[np.uint8]:
+        """Return (height, width, 3) RGB of the scene, from its first camera.
+
+        Raises:
+            PlatformError: MuJoCo draws nothing here.
+        """
+        try:
+            if self._renderer is None:
+                self._renderer = mujoco.Renderer(self.model, height, width)
+            self._renderer.update_scene(self.data, 0 if self.model.ncam else -1)
+            drawn: npt.NDArray[np.uint8] = self._renderer.render()
+        except Exception as error:
+            raise PlatformError(f"no picture ({error}): start Python with MUJOCO_GL=egl or osmesa") from error
+        return drawn
+
+    def close(self) -> None:
+        """Give up what pictures need. Idempotent."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
     def _touches(self, numbers: npt.NDArray[np.intp], sides: npt.NDArray[np.intp]) -> list[Touching]:
         """Return the contacts of these numbers, each felt at one of its two sides, that are near a module's taxels."""

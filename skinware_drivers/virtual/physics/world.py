@@ -158,15 +158,9 @@ class PhysicsWorld:
 
     def __init__(self, bound: Bound, *, seed: int = 0, speed: float = 1.0, has_services: bool = False) -> None:
         self.scene = PhysicsScene(bound)
-        self.origin_ns: int | None = None
-        self.left_out_s = 0.0
         self._speed = speed
-        self._transfers = [
-            Transfer(bound.settings(module.binding), module.position_m, (seed, module.binding.device, number))
-            for number, module in enumerate(self.scene.modules)
-        ]
+        self._bound = bound
         self._of_device: dict[int, list[tuple[int, int]]] = {}  # device -> modules, and their first values
-        self._forces: list[ArrayF] | None = None
         next_value: dict[int, int] = {}
         for number, module in enumerate(self.scene.modules):
             device, axes = module.binding.device, module.binding.axes
@@ -174,18 +168,29 @@ class PhysicsWorld:
             next_value[device] = first + len(axes) * len(module.position_m)
             self._of_device.setdefault(device, []).append((number, first))
         self._ends = next_value
-        self._file = bound.file
         self._has_services = has_services
         self._services: WorldServices | None = None
         self._at_end: Callable[[], object] | None = None
+        self.reset(seed)
+
+    def reset(self, seed: int) -> None:
+        """Begin at 0 s of the scene, with elastomers that feel and remember nothing."""
+        self.scene.reset()
+        self.origin_ns: int | None = None
+        self.left_out_s = 0.0
+        self._forces: list[ArrayF] | None = None
+        self._transfers = [
+            Transfer(self._bound.settings(module.binding), module.position_m, (seed, module.binding.device, number))
+            for number, module in enumerate(self.scene.modules)
+        ]
 
     def fit(self, numbers: Sequence[int], n_values: int) -> None:
         for device, end in self._ends.items():
             if device not in numbers:
                 known = ",".join(map(str, numbers))
-                raise ConfigurationError(f"{self._file}: there is no device {device}; there are {known}")
+                raise ConfigurationError(f"{self._bound.file}: there is no device {device}; there are {known}")
             if end > n_values:
-                raise ConfigurationError(f"{self._file}: device {device} has {n_values} values, not {end}")
+                raise ConfigurationError(f"{self._bound.file}: device {device} has {n_values} values, not {end}")
 
     def advance(self, time_ns: int) -> None:
         """Let the physics run to a time of the devices; the first call is at 0 s of the scene."""
@@ -228,7 +233,19 @@ class PhysicsWorld:
                     values[rows] = counts[:, _AXES.index(axis)]
         return values
 
+    def rows(self, numbers: Sequence[int], n_values: int) -> npt.NDArray[np.int64]:
+        """Return (n,) where the values of taxels are among those of all devices, module by module."""
+        self.fit(numbers, n_values)
+        found = []
+        for device, modules in self._of_device.items():
+            for module, first in modules:
+                taxels = self.scene.modules[module]
+                felt = np.tile([axis in _AXES for axis in taxels.binding.axes], len(taxels.position_m))
+                found.append(list(numbers).index(device) * n_values + first + np.flatnonzero(felt))
+        return np.concatenate(found)
+
     def close(self) -> None:
+        self.scene.close()
         self._services = None
         if self._at_end is not None:
             self._at_end()

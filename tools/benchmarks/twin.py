@@ -8,6 +8,7 @@ are random by the seed alone.
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import NamedTuple
@@ -23,6 +24,7 @@ from skinware.tactile.curves import CurveTable
 from skinware.tactile.neighbours import neighbours
 from skinware.tactile.onsets import EventKind, Events
 from skinware.tactile.testing import Surface
+from skinware_drivers.learning import SkinEnv
 from skinware_drivers.virtual.physics import WORLD_NS
 from skinware_drivers.virtual.physics.binding import Bound, find_binding
 from skinware_drivers.virtual.physics.body import Touching
@@ -219,6 +221,23 @@ def loosened_grip(seed: int, hold_s: float) -> str:
     return f"{text} | 100 %, 0 | {verdict}"
 
 
+def learning(seed: int, steps: int) -> str:
+    rate_hz, per_s = 50.0, []
+    for through_driver in (False, True):
+        env = SkinEnv("mujoco:gripper", "robotiq_tsf", rate_hz=rate_hz, through_driver=through_driver)
+        lift, close, tray, tray_lift = np.zeros((4, steps))
+        lift[:], close[:] = -0.065, np.linspace(0, 0.02, steps)
+        env.reset(seed=seed)
+        begin_s = time.process_time()
+        for action in np.column_stack([lift, close, tray, tray_lift]):
+            env.step(action)
+        per_s.append(steps / (time.process_time() - begin_s))
+        env.close()
+    direct, driven = per_s
+    text = f"{direct:.0f} steps a second of a processor without a wire, {driven:.0f} through it: {direct / driven:.1f}"
+    return f"{text} times; {direct / rate_hz:.1f} times real time | 100 times | {judged(direct >= 100 * driven)}"
+
+
 def judged(holds: bool) -> str:
     return "holds" if holds else "MISSED"
 
@@ -238,6 +257,7 @@ def main() -> None:
         "force after calibration, 5 s of rest": lambda: force(arguments.seed, arguments.presses, 5.0),
         **{f"slip onset at {rate} Hz": partial(slip_onset, arguments.seed, arguments.slips, rate) for rate in RATES_HZ},
         "loosened grip": lambda: loosened_grip(arguments.seed, arguments.hold),
+        "learning, 50 steps a second of the gripper": lambda: learning(arguments.seed, 500),
     }
     print("| claim | by physics | wanted | |\n|---|---|---|---|")
     for name, row in rows.items():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -304,6 +305,22 @@ def test_a_topic_whose_shape_changes(tmp_path: Path) -> None:
         imported(tmp_path / "walk")
 
 
+def test_messages_that_a_bag_counts_and_lacks_are_reported(tmp_path: Path) -> None:
+    layout = ros.std_msgs__msg__MultiArrayLayout([], 0)
+    made = [
+        (number, "/touch", ros.std_msgs__msg__Float32MultiArray(layout, np.full(3, number, np.float32)))
+        for number in range(4)
+    ]
+    path, map_path = tmp_path / "walk", tmp_path / "map.toml"
+    write_bag(path, "sqlite", made)
+    with contextlib.closing(open_source(path)) as source:
+        map_path.write_text(guess(source))
+    with contextlib.closing(sqlite3.connect(path / "walk.db3")) as database, database:
+        database.execute("DELETE FROM messages WHERE id = 3")
+    converted = convert_foreign(path, tmp_path / "made.mcap", "mcap", map_path)
+    assert converted.notes == [f"{path}: /touch has 3 messages, and should have 4"]
+
+
 # -- YARP ---------------------------------------------------------------------------------------------------------
 
 
@@ -362,7 +379,16 @@ MISTAKES = [
     damaged("many.csv", later("1000,1,2\n"), "many.csv, line 1002: 3 cells instead of 2"),
     damaged("back.csv", later("5,1\n"), "back.csv, row 1001: time goes back by 994 s"),
     damaged("half.csv", later("1000,0.5\n"), "row 1001: 0.5 in taxel_0 is no int32: say another dtype"),
-    damaged("nan.csv", later("nan,1\n"), "row 1001: time nan is no time"),
+    damaged("nan.csv", later("nan,1\n"), "row 1001: time nan s is no time"),
+    damaged("mac.csv", lambda path: path.write_text("time,taxel_0\r0,1\r1,2\r"), "ends with a carriage return"),
+    damaged("cell.csv", later(f"1000,{'9' * 200_000}\n"), "row 1001: inf in taxel_0 is no int32"),
+    damaged("first.csv", lambda path: path.write_text(f"time,taxel_0\n0,{'9' * 200_000}\n"), "a cell has more than"),
+    damaged("line.csv", later("9" * (1 << 20)), "line.csv: a line of 1048576 bytes or more: not a text of numbers"),
+    damaged("time.csv", lambda path: path.write_text(f"time,taxel_0\n{10**30},1\n{10**31},2\n"),
+            "in time is neither a date nor an integer of 64 bits"),
+    damaged("digits.csv", lambda path: path.write_text(f"time,taxel_0\n{'9' * 5000},1\n1,2\n"), "is neither a date"),
+    damaged("wide.npz", lambda path: np.savez_compressed(path, time=TIMES[:2], taxel_0=np.zeros((2, 1 << 21), bool)),
+            "no column of numbers 'taxel_0'"),
     damaged("a.h5", lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(50)), "HDF5 is not read"),
     damaged("a.npy", lambda path: np.save(path, np.zeros(3)), "save it with numpy.savez"),
     damaged("cut.npz", lambda path: cut(path, lambda path: np.savez(path, t=TIMES)), "not an NPZ file, or damaged"),

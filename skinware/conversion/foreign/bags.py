@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -36,7 +36,7 @@ class BagSource(ColumnSource):
         super().__init__(path)
         bags = package("rosbags.highlevel", "bags of ROS")
         stores = package("rosbags.typesys", "bags of ROS")
-        self._files = ExitStack()
+        self._files, self._miscounts = ExitStack(), dict[str, str]()
         with self._blamed("open it with its own tools, or record it again"):
             usual = stores.get_typestore(stores.Stores.LATEST)
             self._bag = self._files.enter_context(bags.AnyReader([path], default_typestore=usual))
@@ -74,16 +74,23 @@ class BagSource(ColumnSource):
         if any(waiting.values()):
             yield {name: np.stack(parts) for name, parts in waiting.items()}
 
+    @property
+    def problems(self) -> Sequence[str]:
+        return list(self._miscounts.values())
+
     def close(self) -> None:
         self._files.close()
 
     def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         bag = self._bag
-        begin_ns, length_ns = bag.start_time, max(1, bag.duration)
+        begin_ns, length_ns, count = bag.start_time, max(1, bag.duration), 0
         with self._blamed(f"recover the bag, or leave {topic} out of the map"):
             for connection, time_ns, data in bag.messages(bag.topics[topic].connections):
                 self.share = (time_ns - begin_ns) / length_ns
                 yield time_ns, bag.deserialize(data, connection.msgtype)
+                count += 1
+        if count != bag.topics[topic].msgcount:
+            self._miscounts[topic] = f"{topic} has {count} messages, and should have {bag.topics[topic].msgcount}"
 
     @contextlib.contextmanager
     def _blamed(self, what_to_do: str) -> Iterator[None]:

@@ -20,6 +20,8 @@ from skinware.conversion.tables import package, pyarrow
 from skinware.errors import ConfigurationError
 
 _BATCH_ROWS = 4096
+_MOST_NUMBERS = 1 << 20
+"""In a row of an array."""
 _TEXTS = ("string", "large_string")
 _EPISODE_GAP_S = 1.0
 """Time between the last row of an episode and the first of the next."""
@@ -46,7 +48,7 @@ class NpzSource(ColumnSource):
         found = {
             name: each
             for name, each in self._arrays.items()
-            if each.dtype.kind in "iufbM" and each.shape and all(each.shape)
+            if each.dtype.kind in "iufbM" and each.shape and all(each.shape) and prod(each.shape[1:]) <= _MOST_NUMBERS
         }
         self.left_out = {
             name: f"{each.dtype} of shape {each.shape}" for name, each in self._arrays.items() if name not in found

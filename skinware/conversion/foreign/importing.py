@@ -75,7 +75,9 @@ class ImportedTable(Table):
                 unit_ns = UNITS_NS[driver.time_unit]
                 wrong = np.flatnonzero(~(np.abs(times * unit_ns) < 2.0**62))
                 if len(wrong):
-                    raise self._wrong(done + int(wrong[0]), f"{driver.time} {times[wrong[0]]} is no time")
+                    raise self._wrong(
+                        done + int(wrong[0]), f"{driver.time} {times[wrong[0]]} {driver.time_unit} is no time"
+                    )
                 is_whole = times.dtype.kind in "iu"
                 times_ns = (
                     times.astype(np.int64) * round(unit_ns) if is_whole else np.rint(times * unit_ns).astype(np.int64)
@@ -200,11 +202,12 @@ class ImportedSource:
 
     @property
     def problems(self) -> list[str]:
-        return [
-            f"{self.path}: {count} missing values of {name} keep the value before, with the status STALE"
+        found = [
+            f"{count} missing values of {name} keep the value before, with the status STALE"
             for name, count in self.missing.items()
             if count
         ]
+        return [f"{self.path}: {each}" for each in [*self.columns.problems, *found]]
 
     def close(self) -> None:
         self.columns.close()

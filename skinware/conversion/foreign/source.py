@@ -27,6 +27,7 @@ class ColumnSource(ABC):
         frames: by table, the name of the coordinate frame of its positions, where the source has one.
         share: part of the last pass over a table that is done, 0 to 1.
         marks: times of episodes, s on the axis of the data, and their names.
+        problems: what the passes so far have missed.
     """
 
     tables: Mapping[str, Mapping[str, tuple[int, ...]]]
@@ -34,6 +35,10 @@ class ColumnSource(ABC):
     frames: Mapping[str, str] = MappingProxyType({})
     marks: Sequence[tuple[float, str]] = ()
     share: float = 0.0
+
+    @property
+    def problems(self) -> Sequence[str]:
+        return ()
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -17,6 +17,8 @@ from skinware.errors import ConfigurationError
 
 _READ_BYTES = 1 << 20
 _SAMPLE_LINES = 200
+_SHOWN = 40
+"""Characters of a cell in a message."""
 _SEPARATORS = ("\t", ";", ",")
 _MISSING = ("", "nan", "null", "none", "na", "n/a")
 _EXACT = 1 << 53
@@ -52,11 +54,11 @@ class TextSource(ColumnSource):
         self._exact = {
             name
             for name, cells in samples.items()
-            if any(cell.strip().isdecimal() and int(cell) >= _EXACT for cell in cells)
+            if any(cell.strip().isdecimal() and float(cell) >= _EXACT for cell in cells)
         }
         wrong = {name: [cell for cell in cells if _number(cell) is None] for name, cells in samples.items()}
         self.left_out = {
-            name: f"{cells[0]!r} is no number"
+            name: f"{cells[0][:_SHOWN]!r} is no number"
             for name, cells in wrong.items()
             if name not in self._dates and len(cells) > len(rows) / 2
         }
@@ -105,7 +107,13 @@ class TextSource(ColumnSource):
     def _cells(self, line: str) -> list[str]:
         if self._separator is None:
             return line.split()
-        return next(csv.reader([line], delimiter=self._separator), [])
+        try:
+            return next(csv.reader([line], delimiter=self._separator), [])
+        except csv.Error:
+            raise ConfigurationError(
+                f"{self.path}: a cell has more than {csv.field_size_limit()} characters, or ends with a carriage return"
+                " alone: save it with line feeds"
+            ) from None
 
     # -- rows -----------------------------------------------------------------------------------------------------
 
@@ -148,9 +156,9 @@ class TextSource(ColumnSource):
                 if name in self._dates:
                     found.append(int(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64)))
                 else:
-                    found.append(int(cell))
-            except ValueError:
-                self._damaged(line, f"{cell!r} in {name} is neither a date nor an integer")
+                    found.append(np.int64(int(cell)))
+            except (ValueError, OverflowError):
+                self._damaged(line, f"{cell[:_SHOWN]!r} in {name} is neither a date nor an integer of 64 bits")
         return np.array(found, np.int64)
 
     def _split(self, lines: list[str], first: int) -> Iterator[tuple[int, list[str]]]:
@@ -164,11 +172,13 @@ class TextSource(ColumnSource):
     def _float(self, cell: str, line: int) -> float:
         number = _number(cell)
         if number is None:
-            self._damaged(line, f"{cell!r} is no number")
+            self._damaged(line, f"{cell[:_SHOWN]!r} is no number")
         return number
 
     def _lines_of(self, read: Sequence[bytes], at: int) -> list[str]:
         data = b"".join(read)
+        if max(map(len, read), default=0) >= _READ_BYTES:
+            raise ConfigurationError(f"{self.path}: a line of {_READ_BYTES} bytes or more: not a text of numbers")
         try:
             text = data.decode("utf-8-sig" if not at else "utf-8")
         except UnicodeDecodeError as error:

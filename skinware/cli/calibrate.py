@@ -25,6 +25,14 @@ _pitch = click.option(
     default=0.0065,
     help="Distance between neighbouring sensors, metres.",
 )
+_offset = click.option(
+    "--offset",
+    "offset_m",
+    type=float,
+    metavar="M",
+    default=0.0,
+    help="Distance from sensors outwards to points: radius of the probe, and the cover. Needs --layout with normals.",
+)
 _gathering = cli.options(
     cli.driver_option,
     cli.type_option("Sensors.  [default: pressure, or the first type]"),
@@ -106,14 +114,7 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
 @_pressing
 @click.option("--column", metavar="NAME", default="point_m", help="With the points, metres.")
 @click.option("--layout", metavar="FILE", type=cli.FILE, help="Geometry whose modules have the right shapes.")
-@click.option(
-    "--offset",
-    "offset_m",
-    type=float,
-    metavar="M",
-    default=0.0,
-    help="Distance from sensors outwards to points: radius of the probe, and the cover. Needs --layout with normals.",
-)
+@_offset
 @_pitch
 @_gathering
 def touch(
@@ -183,6 +184,7 @@ def touch(
     default=(0, 0, 0),
     help="Estimate of the tip in the frame of its carrier.",
 )
+@_offset
 @_pitch
 @_gathering
 def finger(
@@ -194,6 +196,7 @@ def finger(
     column: str,
     layout: Path,
     tip_m: tuple[float, float, float],
+    offset_m: float,
     pitch_m: float,
     **options: Any,
 ) -> None:
@@ -213,7 +216,7 @@ def finger(
         structure, type_name = gathering.structure, gathering.type_name
         _, shapes = read_layout(structure, type_name, layout)
         gathering.run(_PRESS, how.share, how.duration_s)
-        found = place_finger(session.presses, shapes, tip_m)
+        found = place_finger(session.presses, shapes, tip_m, offset_m=offset_m)
         write_places(file, gathering, found, frame or service, pitch_m)
     tip = [round(number, 6) for number in found.tip_m.tolist()]
     words = f"; the tip is at {', '.join(f'{1e3 * number:.1f}' for number in tip)} mm"

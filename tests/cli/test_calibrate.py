@@ -243,10 +243,13 @@ def test_finger_from_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     file = tmp_path / "skin.toml"
     with finger_presses(file, surface) as arguments:
         assert exit_status(command, arguments) == 0
+        found = read_geometry(file).of(structure_of(surface), "pressure")
+        assert exit_status(command, [*arguments, "--offset", "0.01"]) == 0
     done = lines(capsys.readouterr().out)[-1]
     assert np.allclose(done["tip_m"], TIP_M, atol=0.002)
-    found = read_geometry(file).of(structure_of(surface), "pressure")
     assert off_m(surface, found.position_m).mean() < 0.002
+    below = read_geometry(file).of(structure_of(surface), "pressure")
+    assert np.allclose(below.position_m, found.position_m - 0.01 * found.normal, atol=1e-5)
 
 
 @pytest.mark.thorough

@@ -52,6 +52,13 @@ def test_modules_without_a_shape_are_left_out() -> None:
     assert off_m(surface, found.position_m)[20:].mean() < 0.002
 
 
+def test_a_round_tip_is_above_the_skin() -> None:
+    surface = arm((0,))
+    given = with_hand(presses(surface, 2), 2)
+    at_tip, below = (place_finger(given, shapes(surface), TIP_M, offset_m=offset_m) for offset_m in (0.0, 0.01))
+    assert np.allclose(below.position_m, at_tip.position_m - 0.01 * at_tip.normal)
+
+
 def test_what_cannot_be_solved_is_refused() -> None:
     surface = arm((0,))
     given = presses(surface, 1)

@@ -26,16 +26,20 @@ _PROGRESS = 1e-6  # share of the cost: a round that gains less is the last
 _LEAST_DAMPING, _MOST_DAMPING, _TINY = 1e-9, 1e6, 1e-12
 
 
-def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.ArrayLike = (0, 0, 0)) -> Placement:
+def place_finger(
+    presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.ArrayLike = (0, 0, 0), *, offset_m: float = 0.0
+) -> Placement:
     """Find the places of the tip and the modules.
 
     Args:
         presses: with (4, 4) poses of the finger's carrier, in the frame of the skin.
         shapes: shapes of modules, by number; taxels of others are left out.
         tip_m: first guess of the tip.
+        offset_m: from the taxels outwards to the tip: the radius of a round one, whose middle it is, and the cover.
 
     Raises:
-        ConfigurationError: presses without poses, too few of them, or no module that enough of them touched.
+        ConfigurationError: presses without poses, too few of them, or no module that enough of them touched; an offset
+            without normals.
     """
     if presses.pose.ndim != 3:
         raise ConfigurationError("presses with points do not determine a finger: give (4, 4) poses of its carrier")
@@ -43,7 +47,7 @@ def place_finger(presses: Presses, shapes: Mapping[int, Shape], tip_m: npt.Array
         raise ConfigurationError(f"{len(presses)} presses: a finger needs at least {_LEAST_PRESSES}")
     problem = _Problem.of(presses, shapes, np.asarray(tip_m, np.float64))
     problem.solve()
-    return problem.placement()
+    return problem.placement().beneath(offset_m)
 
 
 def _points_m(presses: Presses, tip_m: Doubles) -> Doubles:

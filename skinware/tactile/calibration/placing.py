@@ -61,6 +61,21 @@ class Placement:
         counting = self.residual_m[~self.wrong]
         return float(np.median(counting)) if len(counting) else float("nan")
 
+    def beneath(self, offset_m: float) -> Placement:
+        """Return the places so far within, m, where these are of the points that touched.
+
+        Raises:
+            ConfigurationError: an offset without normals.
+        """
+        if not offset_m:
+            return self
+        if not np.isfinite(self.normal).all(axis=1).any():
+            raise ConfigurationError(
+                "an offset of the points needs the layout of modules with normals: which way is out?"
+            )
+        inner = self.position_m - offset_m * self.normal
+        return replace(self, position_m=np.where(np.isfinite(self.normal), inner, self.position_m))
+
 
 def place(
     presses: Presses,
@@ -103,13 +118,8 @@ def place(
     if layout_m is not None:
         modules = [shape.taxel for shape in shapes.values()]
         tool = compare_with_layout(tool, position, layout_m, modules, tool_error_m, is_here=is_here)
-    if offset_m:
-        if not np.isfinite(normal).all(axis=1).any():
-            raise ConfigurationError(
-                "an offset of the points needs the layout of modules with normals: which way is out?"
-            )
-        position = np.where(np.isfinite(normal), position - offset_m * normal, position)
-    return Placement(position, normal, error, presses.times_pressed, residual, trust <= 0, tool)
+    found = Placement(position, normal, error, presses.times_pressed, residual, trust <= 0, tool)
+    return found.beneath(offset_m)
 
 
 def _settled(presses: Presses, shapes: Mapping[int, Shape]) -> tuple[Doubles, Doubles, Doubles, bool]:

@@ -11,6 +11,8 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import msgspec
@@ -30,6 +32,7 @@ from skinware_drivers.virtual.physics.binding import Bound, find_binding
 from skinware_drivers.virtual.physics.body import Touching
 from skinware_drivers.virtual.physics.world import PhysicsWorld
 from tests.specification.chain import Onsets
+from tests.virtual.self_touch import RADIUS_M, gathered, placed, self_touch
 
 ArrayF = npt.NDArray[np.float64]
 PERIOD_NS = 10_000_000
@@ -221,6 +224,15 @@ def loosened_grip(seed: int, hold_s: float) -> str:
     return f"{text} | 100 %, 0 | {verdict}"
 
 
+def self_touch_places(seed: int, presses: int) -> str:
+    with TemporaryDirectory() as folder:
+        world = PhysicsWorld(find_binding(self_touch(Path(folder), presses, seed), "xela"))
+    session = gathered(world, presses, world.scene.carried)
+    off_mm = 1e3 * np.linalg.norm(placed(world, session, RADIUS_M)[1], axis=1)
+    text = f"p50 {np.median(off_mm):.2f}, most {off_mm.max():.2f} mm; {len(session.presses)} of {presses} presses found"
+    return f"{text} | half a pitch, 1.5 mm | {judged(off_mm.max() <= 1.5)}"
+
+
 def learning(seed: int, steps: int) -> str:
     rate_hz, per_s = 50.0, []
     for through_driver in (False, True):
@@ -257,6 +269,7 @@ def main() -> None:
         "force after calibration, 5 s of rest": lambda: force(arguments.seed, arguments.presses, 5.0),
         **{f"slip onset at {rate} Hz": partial(slip_onset, arguments.seed, arguments.slips, rate) for rate in RATES_HZ},
         "loosened grip": lambda: loosened_grip(arguments.seed, arguments.hold),
+        "calibration by self-touch, pitch 3 mm": lambda: self_touch_places(arguments.seed, 2 * arguments.presses),
         "learning, 50 steps a second of the gripper": lambda: learning(arguments.seed, 500),
     }
     print("| claim | by physics | wanted | |\n|---|---|---|---|")

@@ -26,6 +26,8 @@
     [pose.open]                           # targets of actuators
     left = 0.03
 
+    carrier = "thumb_tip"                 # body whose pose in the frame of the first module's the service joints has
+
     [[move]]                              # what the scene does by itself
     at_s = 1.0
     pose = "open"
@@ -97,6 +99,7 @@ class Binding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     pose: dict[str, dict[str, float]] = {}
     move: tuple[Move, ...] = ()
     repeat_s: _Positive | None = None
+    carrier: str = ""
 
 
 class Bound(msgspec.Struct, frozen=True):

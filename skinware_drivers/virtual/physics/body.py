@@ -50,6 +50,7 @@ class PhysicsScene:
     Attributes:
         model: MuJoCo's model, with a tactile sensor for each geom under taxels.
         modules: the taxels, in the order of the binding.
+        carrier: the body of the binding's ``carrier``; None: it has none.
         touched_s: time of the scene when the present touch of modules began; NaN: nothing touches them.
     """
 
@@ -60,7 +61,9 @@ class PhysicsScene:
             self.modules: list[BoundTaxels] = [place(bare, module, bound) for module in bound.binding.module]
             add_sensors(spec, self.modules)
             self.model: Any = spec.compile()
-        except ValueError as error:
+            carrier = bound.binding.carrier
+            self.carrier: int | None = self.model.body(carrier).id if carrier else None
+        except (KeyError, ValueError) as error:
             raise ConfigurationError(f"{bound.scene}: MuJoCo: {error}") from None
         self.data: Any = mujoco.MjData(self.model)
         self._sensors = place_sensors(self.model, self.modules)
@@ -105,6 +108,14 @@ class PhysicsScene:
             elif math.isnan(self.touched_s):
                 self.touched_s = float(self.data.time) - step_s
         return max(0, steps)
+
+    def carried(self) -> ArrayF:
+        """Return (4, 4) the pose of the carrier, in the frame of the first module's body, m."""
+        pose, here = np.eye(4), self.modules[0].body
+        to_here = self.data.xmat[here].reshape(3, 3).T
+        pose[:3, :3] = to_here @ self.data.xmat[self.carrier].reshape(3, 3)
+        pose[:3, 3] = to_here @ (self.data.xpos[self.carrier] - self.data.xpos[here])
+        return pose
 
     def raw(self, module: int) -> ArrayF:
         """Return (3, n) MuJoCo's own sensor data of a module: depth, m, and its products with two speeds of slip."""

@@ -17,7 +17,7 @@ from skinware_drivers.virtual.physics.binding import Bound
 from skinware_drivers.virtual.physics.body import PhysicsScene
 from skinware_drivers.virtual.physics.transfer import Transfer
 
-TRUTH, JOINTS = "truth", "joints"
+TRUTH, JOINTS, POSE = "truth", "joints", "pose"
 RATE_HZ = 100
 _MOST = 32
 _LONGEST_NAME = 64
@@ -64,6 +64,7 @@ class WorldServices:
                 "velocity": floats((max(1, joints),), "", "of each joint, rad/s or m/s"),
                 "target": floats((max(1, actuators),), "", "of each actuator"),
                 "commanded_s": floats((1,), "s", "time of the scene at the newest command; NaN: none yet"),
+                **({} if scene.carrier is None else {POSE: floats((4, 4), "m", "pose of the binding's carrier")}),
             },
             {
                 "joint_name": _texts(scene.joints),
@@ -130,6 +131,8 @@ class WorldServices:
             columns["velocity"][row] = scene.data.qvel[velocity]
         columns["target"][: len(scene.actuators.names)] = scene.data.ctrl
         columns["commanded_s"][0] = scene.actuators.commanded_s
+        if scene.carrier is not None:
+            columns[POSE][:] = scene.carried()
         self._joints.commit(time_ns)
 
 

@@ -6,6 +6,8 @@ import pytest
 
 pytest.importorskip("mujoco", reason="needs the extra mujoco")
 
+from pathlib import Path
+
 import numpy as np
 
 from skinware_drivers.virtual.hardware import load_emulator
@@ -13,7 +15,7 @@ from skinware_drivers.virtual.physics.binding import SCENES, find_binding
 from skinware_drivers.virtual.physics.body import PhysicsScene
 
 from .rig import MS, START_NS
-from .scenes import course_of
+from .scenes import course_of, hardware_in
 
 SHIPPED = sorted(path.name.removesuffix(".toml").split(".") for path in SCENES.glob("*.toml"))
 
@@ -101,3 +103,79 @@ def test_roboskin_boards_show_where_physics_strokes_them() -> None:
     assert len(touched) >= 4, "it crosses triangles"
     untouched = [least for (board, _), least in pressed.items() if board != 7]
     assert min(untouched) > 228, "no other board feels it"
+
+
+Triple = tuple[float, float, float]
+
+FINGER_TIP, LINK = ((0, 0, 0.013), (0.008, 0.008, 0.0145)), ((0.02, -0.001, 0), (0.026, 0.0095, 0.012))
+THUMB_LINK = ((0, 0.02, 0), (0.0095, 0.026, 0.012))
+PALM = ((0.089, 0, 0), (0.0475, 0.0165, 0.041))
+MENAGERIE: dict[str, dict[str, tuple[Triple, Triple, Triple]]] = {
+    "shadow_hand": {f"rh_{finger}distal": (*FINGER_TIP, (0, -1, 0)) for finger in ("ff", "mf", "rf", "lf", "th")},
+    "leap_hand": {
+        **{
+            f"{finger}_ds": ((-0.001, -0.035, 0.0145), (0.0105, 0.015, 0.012), (-1, 0, 0))
+            for finger in ("if", "mf", "rf")
+        },
+        "th_ds": ((-0.001, -0.047, -0.0145), (0.0105, 0.015, 0.012), (-1, 0, 0)),
+    },
+    "unitree_g1": {
+        **{
+            f"{side}_hand_{finger}_{number}_link": (*LINK, (0, sign, 0))
+            for side, sign in (("left", -1), ("right", 1))
+            for finger in ("middle", "index")
+            for number in (0, 1)
+        },
+        **{
+            f"{side}_hand_thumb_{number}_link": ((0, sign * THUMB_LINK[0][1], 0), THUMB_LINK[1], (1, 0, 0))
+            for side, sign in (("left", -1), ("right", 1))
+            for number in (1, 2)
+        },
+        "left_wrist_yaw_link": (*PALM, (0, -1, 0)),
+        "right_wrist_yaw_link": (*PALM, (0, 1, 0)),
+    },
+}
+"""Bodies with taxels, as boxes: middle and half of the size in the frame of the body, m, and the way it bends.
+
+Source: joints, boxes and .obj meshes of google-deepmind/mujoco_menagerie, 4035abd; the sizes of the G1's hands are
+those of the meshes in mani_skill 3.0.1.
+"""
+NUMBERS: dict[str, dict[str, tuple[int, ...]]] = {
+    "shadow_hand": {"boards": (1, 2, 3, 4, 5)},
+    "leap_hand": {"boards": (1, 2, 3, 4)},
+    "unitree_g1": {},
+}
+
+
+def texts(numbers: Triple) -> str:
+    return " ".join(map(str, numbers))
+
+
+@pytest.mark.parametrize("model", MENAGERIE)
+def test_a_binding_of_menagerie_feels_on_the_side_to_which_each_finger_bends(model: str, tmp_path: Path) -> None:
+    (driver,) = (driver for name, driver in SHIPPED if name == model)
+    folder = tmp_path / model
+    folder.mkdir()
+    bodies = "".join(
+        f'<body name="{name}" pos="{number} 0 0"><geom type="box" pos="{texts(place)}" size="{texts(size)}"/></body>'
+        for number, (name, (place, size, _)) in enumerate(MENAGERIE[model].items())
+    )
+    ball = '<body name="ball" pos="0 9 0"><freejoint/><geom size="0.004" mass="0.01"/></body>'
+    (folder / "scene.xml").write_text(
+        f'<mujoco><option gravity="0 0 0"/><worldbody>{bodies}{ball}</worldbody></mujoco>'
+    )
+    world = f"mujoco:{folder / 'scene.xml'}"
+    hardware_in(world, driver, **NUMBERS[model])[0].skip(START_NS)
+    scene = PhysicsScene(find_binding(world, driver))
+    assert {module.binding.body for module in scene.modules} == set(MENAGERIE[model])
+    for number, module in enumerate(scene.modules):
+        outward = np.array(MENAGERIE[model][module.binding.body][2])
+        np.testing.assert_allclose(module.axes[:, 2], np.tile(outward, (len(module.axes), 1)), atol=1e-9)
+        scene.reset()
+        touched = scene.data.xpos[module.body] + module.position_m.mean(axis=0)
+        scene.data.joint(0).qpos[:3] = touched + 0.0041 * outward
+        scene.data.body("ball").xfrc_applied[:3] = -1.0 * outward
+        scene.step_to(0.05)
+        newtons = [forces[:, 2].sum() for forces in scene.newtons()]
+        assert newtons[number] == pytest.approx(1.0, rel=0.05), module.name
+        assert sum(newtons) == newtons[number]

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import sqlite3
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -157,6 +158,12 @@ def test_npz(tmp_path: Path, dtype: str) -> None:
     assert series.structure.matrices("pressure").keys() == {"palm tactile"}
     assert series.structure.geometry is not None
     np.testing.assert_array_equal(series.structure.geometry.position_m, places)
+
+
+def test_switches_are_no_times(tmp_path: Path) -> None:
+    path = tmp_path / "switches.npz"
+    np.savez(path, time=TIMES, touch_0=np.arange(N) > 9)
+    require(only(path), (np.arange(N) > 9)[:, None])
 
 
 def test_npz_in_columns_compressed_and_of_three_axes(tmp_path: Path) -> None:
@@ -369,6 +376,13 @@ def later(text: str) -> Callable[[Path], object]:
     return lambda path: path.write_text(f"time,taxel_0\n{rows}{text}")
 
 
+def zipped(path: Path, name: str, data: bytes, method: int = 0) -> None:
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr(name, data)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(b"PK\1\2\x14\3\x14\0\0\0\0", b"PK\1\2\x14\3\x14\0\0\0" + bytes([method])))
+
+
 MISTAKES = [
     damaged("no.csv", lambda path: path.write_text("hello\nworld\n"), "no line with numbers in it"),
     damaged("none.csv", lambda path: path.write_text(""), "no line with numbers in it"),
@@ -387,6 +401,16 @@ MISTAKES = [
     damaged("time.csv", lambda path: path.write_text(f"time,taxel_0\n{10**30},1\n{10**31},2\n"),
             "in time is neither a date nor an integer of 64 bits"),
     damaged("digits.csv", lambda path: path.write_text(f"time,taxel_0\n{'9' * 5000},1\n1,2\n"), "is neither a date"),
+    damaged("bare.npz", lambda path: zipped(path, "time", np.lib.format.magic(1, 0)), "bare.npz: not an NPZ file"),
+    damaged("deep.npz", lambda path: zipped(path, "time.npy", np.lib.format.magic(1, 0) + b"\xe8\x03" + b"(" * 1000),
+            "deep.npz: not an NPZ file, or damaged"),
+    damaged("head.npz", lambda path: zipped(path, "time.npy", np.lib.format.magic(2, 0) + bytes([0, 0, 1, 0]) * 40_000),
+            "head.npz: not an NPZ file, or damaged"),
+    damaged("packed.npz", lambda path: zipped(path, "time.npy", b"", method=99), "compression method is not supported"),
+    damaged("late.npz", lambda path: np.savez(path, time=np.array(["2600", "2601"], "M8[Y]"), taxel_0=[1, 2]),
+            "row 1: time -9223372036854775808 s is no time"),
+    damaged("two.parquet", lambda path: pa.parquet.write_table(
+        pa.table([TIMES, TIMES, TIMES], names=["time", "taxel_0", "taxel_0"]), path), "no column of numbers 'taxel_0'"),
     damaged("wide.npz", lambda path: np.savez_compressed(path, time=TIMES[:2], taxel_0=np.zeros((2, 1 << 21), bool)),
             "no column of numbers 'taxel_0'"),
     damaged("a.h5", lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(50)), "HDF5 is not read"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 from pathlib import Path
 from threading import Event
 from typing import Any, cast
@@ -22,6 +23,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.commands import PATIENCE_S, running
+from tests.streams.peers import LOCAL
 from tests.views.test_scene import a_hand
 
 PROTOCOL, MESSAGE, HEAD = Subprotocol("foxglove.sdk.v1"), 1, 13
@@ -107,3 +109,15 @@ def test_foxglove_reads_points_and_states() -> None:
     expected = skin.structure.physical(np.full(skin.structure.n_sensors, 40), PRESSURE.name)
     np.testing.assert_allclose(np.ascontiguousarray(rows[:, at : at + 4]).view("<f4")[:, 0], expected)
     assert json.loads(messages["/skin/torso/state"])["driver"] == "torso"
+
+
+def test_foxglove_ends_beside_clients_that_say_nothing_or_leave_without_a_word() -> None:
+    with publishing(torso()), running("skin-bridge", "foxglove", "--port", "0") as bridge:
+        url = bridge.wait_for("ready")["to"]
+        place = (LOCAL, int(url.rpartition(":")[2]))
+        with socket.create_connection(place), connect(url, subprotocols=[PROTOCOL], max_size=None) as client:
+            socket.create_connection(place).close()  # a scanner of ports
+            client.recv(PATIENCE_S)
+            client.socket.shutdown(socket.SHUT_RDWR)
+            bridge.stop()
+    assert bridge.errors == ""

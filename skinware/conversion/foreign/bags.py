@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.source import BLOCK_BYTES, ColumnSource, Rows
+from skinware.conversion.foreign.source import BLOCK_BYTES, ColumnSource, Rows, blamed
 from skinware.conversion.tables import package
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
@@ -92,16 +92,12 @@ class BagSource(ColumnSource):
         if count != bag.topics[topic].msgcount:
             self._miscounts[topic] = f"{topic} has {count} messages, and should have {bag.topics[topic].msgcount}"
 
-    @contextlib.contextmanager
-    def _blamed(self, what_to_do: str) -> Iterator[None]:
-        try:
-            yield
-        except (ConfigurationError, OSError, GeneratorExit, KeyboardInterrupt):
-            raise
-        except Exception as error:  # noqa: BLE001, rosbags raises whatever its parsers meet
+    def _blamed(self, what_to_do: str) -> contextlib.AbstractContextManager[None]:
+        def say(reason: str) -> str:
             where = f" at {self.share:.0%}" if self.share else ""
-            what = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ConfigurationError(f"{self.path}: no bag of ROS, or damaged{where} ({what}): {what_to_do}") from None
+            return f"{self.path}: no bag of ROS, or damaged{where} ({reason}): {what_to_do}"
+
+        return blamed(say)
 
 
 def _columns(message: Any) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import zipfile
 from collections.abc import Collection, Iterator
@@ -15,11 +16,12 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.source import BLOCK_BYTES, ColumnSource, Rows
+from skinware.conversion.foreign.source import BLOCK_BYTES, ColumnSource, Rows, blamed
 from skinware.conversion.tables import package, pyarrow
 from skinware.errors import ConfigurationError
 
 _BATCH_ROWS = 4096
+_HEADER_BYTES = 1 << 16
 _MOST_NUMBERS = 1 << 20
 """In a row of an array."""
 _TEXTS = ("string", "large_string")
@@ -40,11 +42,9 @@ class NpzSource(ColumnSource):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        try:
+        with blamed(lambda reason: f"{path}: not an NPZ file, or damaged ({reason})"):
             self._zip = zipfile.ZipFile(path)
             self._arrays = {name.removesuffix(".npy"): self._head(name) for name in self._zip.namelist()}
-        except (zipfile.BadZipFile, ValueError, EOFError, SyntaxError) as error:
-            raise ConfigurationError(f"{path}: not an NPZ file, or damaged ({error})") from None
         found = {
             name: each
             for name, each in self._arrays.items()
@@ -70,7 +70,8 @@ class NpzSource(ColumnSource):
             1, BLOCK_BYTES // max(1, sum(prod(each.shape[1:]) * each.dtype.itemsize for each in arrays.values()))
         )
         with ExitStack() as stack:
-            streams = {name: self._open(name, stack) for name in arrays}
+            with blamed(lambda reason: f"{self.path}: damaged ({reason}): save it again"):
+                streams = {name: self._open(name, stack) for name in arrays}
             for first in range(0, length, count):
                 until = min(first + count, length)
                 self.share = until / length
@@ -96,25 +97,28 @@ class NpzSource(ColumnSource):
             return stream[first:until]
         shape, dtype, _ = self._arrays[name]
         size = (until - first) * prod(shape[1:]) * dtype.itemsize
-        try:
+        with blamed(lambda reason: f"{self.path}: {name} is damaged after row {first} ({reason}): save it again"):
             data = stream.read(size)
-        except (zipfile.BadZipFile, ValueError, EOFError) as error:
-            raise ConfigurationError(f"{self.path}: {name} is damaged after row {first} ({error})") from None
         if len(data) != size:
             raise ConfigurationError(f"{self.path}: {name} ends too early, after row {first}: save it again")
         return _plain(np.frombuffer(data, dtype).reshape(-1, *shape[1:]))
 
 
 def _header(stream: IO[bytes]) -> _Array:
-    version = np.lib.format.read_magic(stream)
+    begin = io.BytesIO(stream.read(_HEADER_BYTES))
+    version = np.lib.format.read_magic(begin)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, in_columns, dtype = read(stream)
-    return _Array(shape, dtype, in_columns and len(shape) > 1)
+    shape, in_columns, dtype = read(begin)
+    stream.seek(begin.tell())
+    return _Array(tuple(map(int, shape)), dtype, in_columns and len(shape) > 1)
 
 
 def _plain(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return times as int64, ns since 1970; other numbers as they are."""
-    return rows.astype("datetime64[ns]").astype(np.int64) if rows.dtype.kind == "M" else rows
+    """Return times as int64, ns since 1970, the least number for none; other numbers as they are."""
+    if rows.dtype.kind != "M":
+        return rows
+    times = rows.astype("datetime64[ns]")  # which wraps
+    return np.where(times.astype(rows.dtype) == rows, times.astype(np.int64), np.iinfo(np.int64).min)
 
 
 class ParquetSource(ColumnSource):
@@ -127,11 +131,12 @@ class ParquetSource(ColumnSource):
             with self._opened(each) as file:
                 self._rows += file.metadata.num_rows
         with self._opened(self._paths[0]) as file:
-            kinds = {field.name: str(field.type) for field in file.schema_arrow}
-            batches = list(islice(file.iter_batches(_BATCH_ROWS), 1))
+            with blamed(lambda reason: f"{path}: damaged ({reason}): write it again"):
+                kinds = {field.name: str(field.type) for field in file.schema_arrow}
+                batches = list(islice(file.iter_batches(_BATCH_ROWS), 1))
         shapes: dict[str, tuple[int, ...]] = {}
         for batch, name in product(batches, kinds):
-            with contextlib.suppress(ConfigurationError):
+            with contextlib.suppress(ConfigurationError, KeyError):  # or two columns of one name
                 found = self._array(self._paths[0], name, batch.column(name))
                 if found.dtype.kind != "U":
                     shapes[name] = found.shape[1:]
@@ -142,20 +147,15 @@ class ParquetSource(ColumnSource):
         done = 0
         for path in self._paths:
             with self._opened(path) as file:
-                try:
+                with blamed(lambda reason: f"{path}: damaged after row {done} ({reason}): write it again"):  # noqa: B023
                     for batch in file.iter_batches(_BATCH_ROWS, columns=list(names)):
                         done += len(batch)
                         self.share = done / self._rows
                         yield {name: self._array(path, name, batch.column(name)) for name in names}
-                except (self._arrow.ArrowException, OSError, KeyError) as error:
-                    what = str(error).splitlines()[0]
-                    raise ConfigurationError(f"{path}: damaged after row {done} ({what}): write it again") from None
 
     def _opened(self, path: Path) -> Any:
-        try:
+        with blamed(lambda reason: f"{path}: not Parquet, or damaged ({reason})"):
             return self._arrow.parquet.ParquetFile(path)
-        except self._arrow.ArrowException as error:
-            raise ConfigurationError(f"{path}: not Parquet, or damaged ({str(error).splitlines()[0]})") from None
 
     def _array(self, path: Path, name: str, column: Any) -> npt.NDArray[Any]:
         shape = [len(column)]

@@ -141,9 +141,8 @@ def _time_of(rows: Rows) -> str:
 
 def _rises(column: npt.NDArray[Any]) -> bool:
     numbers = column.reshape(len(column), -1)
-    return (
-        numbers.shape[1] == 1 and len(numbers) > 1 and bool((np.diff(numbers[:, 0]) >= 0).all() and np.ptp(numbers) > 0)
-    )
+    is_one = numbers.shape[1] == 1 and len(numbers) > 1
+    return is_one and bool((numbers[1:] >= numbers[:-1]).all() and numbers[-1, 0] > numbers[0, 0])
 
 
 def _time_lines(rows: Rows, time: str) -> list[str]:

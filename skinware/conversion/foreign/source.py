@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from skinware.errors import ConfigurationError, SkinwareError
 
 Rows = dict[str, npt.NDArray[Any]]
 """m rows of columns, (m, ...) by name: numbers; times that a file has as such are int64 ns since 1970."""
@@ -54,6 +57,20 @@ class ColumnSource(ABC):
 
     def close(self) -> None:  # noqa: B027, not all keep files open
         """Close the files. Idempotent."""
+
+
+@contextlib.contextmanager
+def blamed(say: Callable[[str], str]) -> Iterator[None]:
+    """Raise what parsers of others raise as ConfigurationError, with what ``say`` makes of the reason."""
+    try:
+        yield
+    except SkinwareError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.filename:
+            raise
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ConfigurationError(say(reason)) from None
 
 
 def whole(source: ColumnSource, table: str, names: Sequence[str], most: int | None = None) -> Rows:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 from dataclasses import asdict
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -249,6 +250,8 @@ def _show_port(event: dict[str, Any]) -> None:
 
 
 _RERUN, _FOXGLOVE_PORT = "rerun+http://127.0.0.1:9876/proxy", 8765
+_STOP_S, _BACKLOG = 1.0, 128
+"""How long the server's end is waited for, and the messages that wait for a slow client at most."""
 
 _rate_option = click.option(
     "--rate",
@@ -318,15 +321,20 @@ def foxglove(
     from skinware.conversion.live import FoxgloveSink
 
     context = foxglove.Context()
+    logging.getLogger("foxglove").setLevel(logging.CRITICAL)  # else a client that leaves costs many lines
     try:
-        server = foxglove.start_server(name="skinware", host=host, port=port, context=context)
+        server = foxglove.start_server(
+            name="skinware", host=host, port=port, context=context, message_backlog_size=_BACKLOG
+        )
     except RuntimeError as error:
         raise click.ClickException(f"{host}, port {port}: {error}") from None
     where = f"ws://{f'[{host}]' if ':' in host else host}:{server.port}"
     try:
         _run(FoxgloveSink(context), names, rate_hz, namespace, as_json, where)
     finally:
-        server.stop()
+        stopping = Thread(target=server.stop, daemon=True)  # it waits for every client that has said nothing yet
+        stopping.start()
+        stopping.join(_STOP_S)
 
 
 def _run(sink: Sink, names: tuple[str, ...], rate_hz: float, namespace: str | None, as_json: bool, where: str) -> None:

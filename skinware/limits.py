@@ -1,6 +1,6 @@
 """How much data of others may ask for: one set of limits for recordings and for links.
 
-Every limit is far above what a real skin needs (30,848 sensors: 0.3 MB a frame, 1.2 MB a head, 16 MiB a ring), and low
+Every limit is far above what a real skin needs (30,848 sensors: 0.3 MB a sample, 1.2 MB a head, 16 MiB a ring), and low
 enough that a small file, or one message of a peer, can neither fill the memory of a robot nor hold up a program.
 """
 
@@ -26,13 +26,13 @@ class Limits:
         json_size: of one JSON text.
         json_depth: arrays and objects within each other in a JSON text.
         head_size: of a service's file up to its slots (tables, places of sensors), unpacked.
-        slot_size: of one frame of a service.
+        slot_size: of one sample of a service.
         ring_size: of all slots of a service that is published here for others.
         robot_size: of the rings and heads of all services of one robot.
         services: of one robot.
         robots: that a program lists, and that one router may have.
         chunk_size: of the contents of a chunk of a recording, decompressed.
-        frames_size: of the frames of one service in one chunk, decoded.
+        frames_size: of the samples of one service in one chunk, decoded.
         ratio: data that becomes more than ``always_size`` may become so many times as large as it is packed.
         always_size: data of any size may become so large; see :meth:`room`.
         time_ns: absolute value of a time, ns; a sum of two such times fits 64 bits.

@@ -44,7 +44,7 @@ def is_fresh(
         at_ns: the moment at which they are looked at, on the clock of ``time_ns``.
             Stamps of more than 0.2 s later are not fresh.
         max_age_ns: the age beyond which nothing is fresh, or (n,) that of each sensor; see ``age_limit_ns``.
-        alive: the driver lived when the frame was taken.
+        alive: the driver ran when the sample was taken.
 
     Returns:
         (..., n) bool.
@@ -57,12 +57,12 @@ def is_fresh(
 
 
 class Status(enum.IntFlag):
-    """Bits of a sensor's status; 0 means fresh and good."""
+    """Bits of a sensor's status; 0: no problem was known when the sample was published."""
 
     NEVER_SEEN = 1
     """No value has arrived since the driver started; the value is meaningless."""
     STALE = 2
-    """The value is older than the patch's last update, or the patch went silent."""
+    """It was valid earlier, and is outdated: older than three periods and 0.2 s, or known to be missing."""
     OUT_OF_RANGE = 4
     """The hardware reports that the true value is beyond its range."""
     NO_ACK = 8
@@ -74,7 +74,7 @@ class Status(enum.IntFlag):
     SUSPECT = 64
     """Some event makes the value doubtful (for example, the hardware moved its own baseline)."""
     UNHEALTHY = 128
-    """The sensor has been stuck, noisy or dead for minutes, so its value is doubtful; skin-calm sets this bit."""
+    """The sensor has had a fault for minutes (stuck, noisy, dead ...), so its value is doubtful; set by skin-calm."""
 
 
 class Why(enum.IntEnum):

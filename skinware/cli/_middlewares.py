@@ -96,7 +96,7 @@ def ros2(
 ) -> None:
     """Publish drivers NAME..., or all, also later ones, in a ROS 2 graph. ROS need not be installed.
 
-    The node publishes frames, point clouds, images and diagnostics of each driver. The graph can only read, unless you
+    The node publishes samples, point clouds, images and diagnostics of each driver. The graph can only read, unless you
     give --tare. Subscribers that are slow, stopped or gone cost the drivers nothing.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
@@ -197,10 +197,11 @@ def yarp(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Publish drivers NAME..., or all, also later ones, as ports of YARP: for each frame a vector of doubles, 0 to 255.
+    """Publish drivers NAME..., or all, also later ones, as ports of YARP.
 
-    A reader that is slow, stopped or gone misses vectors, and costs neither drivers nor other readers anything. YARP
-    has no authentication: all programs that reach a port can read it, and can make it call other ports.
+    Each sample is a vector of doubles, 0 to 255. A reader that is slow, stopped or gone misses vectors, and costs
+    neither drivers nor other readers anything. YARP has no authentication: all programs that reach a port can read it,
+    and can make it call other ports.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """

@@ -76,7 +76,7 @@ def route(
     insecure: bool,
     as_json: bool,
 ) -> None:
-    """Run a router: one address where robots and their users meet. It reads no frames.
+    """Run a router: one address where robots and their users meet. It reads no samples.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
@@ -123,7 +123,7 @@ def route(
 def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json: bool) -> None:
     """Show the drivers of all robots that are reached: rate, age, losses, silent patches, problems, clock error.
 
-    Each robot sends one small message a second for this, and no frames.
+    Each robot sends one small message a second for this, and no samples.
 
     Exit status: 0 done or interrupted, 1 no robot reached, 2 wrong usage.
     """

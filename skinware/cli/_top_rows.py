@@ -133,10 +133,10 @@ def title_of(key: RowKey, structure: Structure, patches: list[int], type_name: s
 
 def plain_line(report: DriverReport) -> str:
     if report.life == STARTING:
-        return f"{report.name}  starting, no frame yet  sensors {report.sensors}"
+        return f"{report.name}  starting, no sample yet  sensors {report.sensors}"
     life = {
         LIVE: "? Hz" if report.rate_hz is None else rate_text(report.rate_hz),
-        DEAD: "DEAD, this is its last frame",
+        DEAD: "DEAD, this is its last sample",
         SILENT: "SILENT, its process publishes nothing",
     }.get(report.life, report.life)
     statuses = [

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 _PORT = 7448
 _MODES = {
-    "push": "the link is fast: every frame is sent when it is published",
-    "pull": "frames wait on the link: only the newest are asked for, as many as it takes",
+    "push": "the link is fast: every sample is sent when it is published",
+    "pull": "samples wait on the link: only the newest are asked for, as many as it takes",
 }
 
 
@@ -133,7 +133,7 @@ def serve(
     "--mode",
     type=click.Choice(["auto", "push", "pull"]),
     default="auto",
-    help="Get every frame (push), or only the newest, as fast as the link takes them (pull).",
+    help="Get every sample (push), or only the newest, as fast as the link takes them (pull).",
 )
 @cli.parts_options
 @cli.json_option
@@ -150,7 +150,7 @@ def join(
 ) -> None:
     """Publish the services of robot R here, with the same names, structures, states and operations.
 
-    Times are moved to the clock of this machine. Frames that the link cannot take are counted as lost. With --patch or
+    Times are moved to the clock of this machine. Samples that the link cannot take are counted as gaps. With --patch or
     --region only those sensors of its drivers travel, and no other services.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.

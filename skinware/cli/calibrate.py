@@ -79,7 +79,7 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
     """Find which sensors lie side by side, from strokes with a finger, and draw a map of each piece of skin.
 
     Only a finger is needed. Curved pieces are unrolled. It ends when 95 % of the sensors have felt the finger in 20
-    frames; longer strokes give better maps.
+    samples; longer strokes give better maps.
     """
     import numpy as np
 

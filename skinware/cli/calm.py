@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     "--config",
     metavar="FILE",
     type=cli.FILE,
-    help="TOML file with the stages: field, baseline, vector, curve, filter, scaler, amplifier.  [default: a baseline]",
+    help="TOML file with the stages: field, thermal, baseline, vector, curve, filter, scaler, amplifier.  [default: a"
+    " baseline]",
 )
 @click.option(
     "--state",
@@ -80,8 +81,8 @@ def command(
 
     In the first seconds the untouched skin is measured. Restarts and changes of the driver do not end it. A restart of
     skin-calm itself keeps baselines for 10 minutes. Programs can call operations: tare, hold, change settings. It also
-    publishes the contacts of the driver, of pressure sensors if there are any, and the health of its sensors: stuck,
-    noisy, clipped, dead and weak sensors get the status UNHEALTHY (skin-info --health shows why).
+    publishes the contacts of the driver, of pressure sensors if there are any, and the health of its sensors: those
+    with a fault (stuck, noisy, dead ...) get the status UNHEALTHY (skin-info --health shows why).
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """

@@ -25,7 +25,7 @@ def _window(text: str) -> int:
     if text == "all":
         return 0
     if not text.isdecimal() or not int(text):
-        raise click.BadParameter(f"{text!r} is not a number of frames, nor all.")
+        raise click.BadParameter(f"{text!r} is not a number of samples, nor all.")
     return int(text)
 
 
@@ -117,7 +117,7 @@ _learning_options = cli.options(
         type=_window,
         default="1",
         metavar="N",
-        help="lerobot: frames of a driver in each row; all: every frame between two rows.",
+        help="lerobot: samples of a driver in each row; all: every sample between two rows.",
     ),
     click.option(
         "--join",
@@ -251,8 +251,9 @@ def command(
         result = {"event": "converted", "file": str(converted.path), "format": format_name}
         print_json({**result, "frames": dict(converted.frames), **in_episodes, "notes": converted.notes})
         return
-    frames = ", ".join(f"{count} frames of {name}" for name, count in converted.frames.items())
-    echo(f"{converted.path}: {frames}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
+    unit = "frames" if format_name in _WIRE_FORMATS else "rows" if format_name in _LEARNING_FORMATS else "samples"
+    counts = ", ".join(f"{count} {unit} of {name}" for name, count in converted.frames.items())
+    echo(f"{converted.path}: {counts}" + (f" in {converted.episodes} episodes" if in_episodes else ""))
 
 
 def _imported(

@@ -51,16 +51,16 @@ _LIFE_COLOURS = {
 @cli.command(
     "skin-info",
     "skin-info                       everything in this namespace",
-    "skin-info roboskin --sensors    every sensor of one driver, in frame order",
-    "skin-info --health              sensors that are stuck, noisy, dead ..., as skin-calm found them",
+    "skin-info roboskin --sensors    every sensor of one driver, in the order of its values",
+    "skin-info --health              faults of sensors, as skin-calm found them",
     "skin-info --json | jq '.drivers[] | {name, rate_hz}'",
 )
 @click.argument("name", required=False)
-@click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its frames.")
+@click.option("--sensors", is_flag=True, help="List the sensors of driver NAME in the order of its values.")
 @click.option(
     "--health",
     is_flag=True,
-    help="List sensors that are stuck, noisy, clipped, dead or weak, here and in the namespace calm.",
+    help="List sensors with a fault (stuck, noisy, dead ...), here and in the namespace calm.",
 )
 @click.option(
     "--watch", is_flag=True, help="Update every second; many patches share a line where the terminal is too low."
@@ -228,8 +228,8 @@ def _statistics_lines(entry: dict[str, Any]) -> list[str]:
     if not wall["count"]:
         return []
     mean, worst, on_cpu = age_text(wall["mean_ns"]), age_text(wall["worst_ns"]), age_text(cpu["mean_ns"])
-    lines = [f"a frame takes {mean} to fill (worst {worst}); with all else {on_cpu} of processor time"]
-    lines.append(f"99 % of its frames are published at most {_bound(statistics['age'])} after their newest data")
+    lines = [f"a sample takes {mean} to fill (worst {worst}); with all else {on_cpu} of processor time"]
+    lines.append(f"99 % of its samples are published at most {_bound(statistics['age'])} after their newest data")
     if statistics["lateness"]["p99_ns"] is not None:
         lines.append(f"99 % of its periods begin up to {_bound(statistics['lateness'])} late")
     return lines
@@ -269,17 +269,17 @@ def _life_line(what: str, entry: dict[str, Any]) -> str:
     if entry["age_ms"] is None:
         parts.append("nothing published yet")
     elif life == "dead":
-        parts += [f"its last data is {age} old and stays readable", f"{count_text(entry['sequence'])} frames"]
+        parts += [f"its last data is {age} old and stays readable", f"{count_text(entry['sequence'])} samples"]
     elif life == "silent":
         parts += [f"its process runs but publishes nothing, newest data {age} old"]
     else:
-        parts += [rate_text(entry["rate_hz"]), f"newest data {age} old", f"frame {count_text(entry['sequence'])}"]
+        parts += [rate_text(entry["rate_hz"]), f"newest data {age} old", f"sample {count_text(entry['sequence'])}"]
     if entry["missed_periods"]:
         parts.append(f"{plural(entry['missed_periods'], 'period')} missed")
     if entry["before_boot"]:
-        parts.append(f"{plural(entry['before_boot'], 'frame')} stamped before this machine booted")
+        parts.append(f"{plural(entry['before_boot'], 'sample')} stamped before this machine booted")
     if entry["ahead"]:
-        parts.append(f"{plural(entry['ahead'], 'frame')} stamped in the future, with nothing fresh")
+        parts.append(f"{plural(entry['ahead'], 'sample')} stamped in the future, with nothing fresh")
     parts.append(f"pid {entry['pid']}")
     return f"{what} {style(entry['name'], bold=True)}: {', '.join(parts)}"
 

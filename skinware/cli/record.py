@@ -133,7 +133,7 @@ def command(
 
     A NAME that ends in .mcap is the new file, as after -o.
 
-    Frames that could not be recorded are counted in the file. If this command is killed, or the disk is full, all but
+    Samples that could not be recorded are counted in the file. If this command is killed, or the disk is full, all but
     the last 0.3 s is in the file, and skin-recover repairs it. If the file is deleted, moved or changed meanwhile, the
     recording ends within a second with status 1.
 

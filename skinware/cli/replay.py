@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from skinware.memory.namespace import Namespace
     from skinware.recording.replaying import Replayer
 
-KEYS = "space: pause   . , : a frame on, back   arrows: 5 s, 1 min   + - 1: speed   l: loop   0: begin   q: end"
+KEYS = "space: pause   . , : a sample on, back   arrows: 5 s, 1 min   + - 1: speed   l: loop   0: begin   q: end"
 _KEY = re.compile(rb"\x1b\[[0-9;]*[A-Za-z~]|\x1bO[A-Z]|[^\x1b]", re.DOTALL)
 _BAR = 20
 
@@ -157,7 +157,7 @@ def publish_again(
 
 
 def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
-    """Keep recorded frames apart from living ones; only warn if the namespace was given as an option."""
+    """Keep recorded samples apart from living ones; only warn if the namespace was given as an option."""
     from skinware.service import ServiceReader
 
     living = []
@@ -167,7 +167,7 @@ def _heed_others(place: Namespace, *, is_chosen: bool) -> None:
                 living += [name] if reader.alive else []
     run = f"{', '.join(living)} {'runs' if len(living) == 1 else 'run'}"
     if living and is_chosen:
-        cli.warn(f"{run} in namespace {place.name!r} too: readers see living and recorded frames side by side")
+        cli.warn(f"{run} in namespace {place.name!r} too: readers see living and recorded samples side by side")
     elif living:
         raise ConfigurationError(
             f"{run} in namespace {place.name!r}: give another one with --namespace, or"

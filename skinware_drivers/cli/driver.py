@@ -108,7 +108,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @click.option(
     "--slots",
     type=click.IntRange(2, 64),
-    help="Ring size: how many frames slow programs may fall behind, 2-64.  [default: a second, at least 8, 16 MiB]",
+    help="Ring size: how many snapshots slow programs may fall behind, 2-64.  [default: a second, at least 8, 16 MiB]",
 )
 @click.option(
     "--latency",
@@ -145,7 +145,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @cli.json_option
 @cli.verbose_option
 def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) -> None:
-    """Run a driver: skin hardware on one or more buses into one stream of frames for any program.
+    """Run a driver: skin hardware on one or more buses into one stream of snapshots for any program.
 
     With several buses, the driver starts with those that are available; the others join when they appear.
 
@@ -267,7 +267,7 @@ def print_capture(capture: Capture, as_json: bool) -> None:
         elif capture.result["problem"]:
             echo(f"{capture.path}: ended early: {capture.result['problem']}", err=True)
         else:
-            missed = f", {capture.result['missed']} frames missed" if capture.result["missed"] else ""
+            missed = f", {capture.result['missed']} samples missed" if capture.result["missed"] else ""
             size = capture.result["bytes"] / 1e6
             echo(f"{capture.path}: {size:.1f} MB{missed}; skin-driver --bus replay:{capture.path} decodes it again")
 

@@ -35,23 +35,27 @@ _SHARED = ("socketcan", "udp_multicast", "virtual")
 
 @cli.command(
     "skin-dump",
-    "skin-dump -n 3                              three frames",
+    "skin-dump -n 3                              three snapshots",
     "skin-dump -T 2 --type pressure              fail when nothing comes for 2 s",
-    "skin-dump --json --rate 10 > frames.jsonl   at most ten frames a second",
+    "skin-dump --json --rate 10 > frames.jsonl   at most ten snapshots a second",
     "skin-dump --raw can0 -n 1000 > can.log      for canplayer -I can.log",
 )
 @click.argument("name", required=False)
-@click.option("-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT frames.")
+@click.option(
+    "-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT snapshots, or frames of --raw."
+)
 @click.option(
     "-T",
     "--timeout",
     "timeout_s",
     metavar="SECONDS",
     type=cli.seconds,
-    help="Fail after SECONDS without a frame; also wait for the driver.",
+    help="Fail after SECONDS without one; also wait for the driver.",
 )
 @cli.type_option("Only the sensors of one type, such as pressure.")
-@click.option("--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest frame, at most HZ times a second.")
+@click.option(
+    "--rate", "rate_hz", type=float, metavar="HZ", help="Only the newest snapshot, at most HZ times a second."
+)
 @click.option("--counts", is_flag=True, help="Raw counts, as the hardware sends them, instead of physical values.")
 @cli.namespace_option
 @cli.json_option
@@ -67,7 +71,7 @@ def command(
     as_json: bool,
     raw: str | None,
 ) -> None:
-    """Print the frames of driver NAME, or of the only one, each once and in order.
+    """Print the snapshots of driver NAME, or of the only one, each once and in order.
 
     Values are physical, in the unit of their type, as skin-top shows them.
 
@@ -149,7 +153,7 @@ def _attach(namespace: Namespace, name: str | None, timeout_s: float | None) -> 
         name = _only_driver(namespace, end_s)
     reader = DriverReader(name, namespace=namespace, timeout_s=max(0.0, end_s - time.monotonic()))
     if not reader.alive:
-        cli.warn(f"driver {name!r} is dead; this is its last frame. Waiting for it to come back")
+        cli.warn(f"driver {name!r} is dead; this is its last snapshot. Waiting for it to come back")
     return reader
 
 

@@ -57,7 +57,7 @@ def speed_text(text: str) -> float:
     "--times",
     type=click.Choice(["now", "recorded"]),
     default="now",
-    help="Times of frames: moved to now, which keeps their ages, or as recorded.",
+    help="Times of samples: moved to now, which keeps their ages, or as recorded.",
 )
 @click.option(
     "--namespace",

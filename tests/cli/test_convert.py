@@ -34,7 +34,7 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(convert, [str(file), "--to", "npz"]) == 0
-    assert capsys.readouterr().out == "walk.npz: 100 frames of torso\n"
+    assert capsys.readouterr().out == "walk.npz: 100 samples of torso\n"
     assert exit_status(convert, [str(file), "--to", "csv", "--start", "0.2", "--end", "0.5", "--json"]) == 0
     out, err = capsys.readouterr()
     note = "walk-csv: counters, histograms and events are left out: csv does not hold them"
@@ -70,7 +70,7 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["walk.mcap", "--to", "npz", "--fps", "30"], 2, "--fps is for --to lerobot"),
         (["walk.mcap", "--to", "npz", "--video"], 2, "--video is for --to lerobot"),
         (["walk.mcap", "--to", "lerobot", "--fps", "0"], 2, "0 is not in the range"),
-        (["walk.mcap", "--to", "lerobot", "--window", "0"], 2, "'0' is not a number of frames, nor all"),
+        (["walk.mcap", "--to", "lerobot", "--window", "0"], 2, "'0' is not a number of samples, nor all"),
         (["walk.mcap", "--to", "lerobot", "--episode", "2..1"], 2, "is not START..END in seconds"),
         (["walk.mcap", "--to", "lerobot", "--episode", "7..8"], 2, "no time in the episode 7..8 has all the data"),
         (["walk.mcap", "--to", "lerobot", "--episodes", "no.csv"], 2, "no.csv: No such file or directory"),
@@ -173,7 +173,7 @@ def test_without_a_package_it_says_which_extra_is_needed(file: Path, package: st
 def test_a_learning_set_for_people_and_programs(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     episodes = ["--episode", "0..0.5", "--episode", "0.6..0.8"]
     assert exit_status(convert, [str(file), "--to", "lerobot", "--fps", "10", *episodes]) == 0
-    assert capsys.readouterr().out == "walk-lerobot: 7 frames of torso in 2 episodes\n"
+    assert capsys.readouterr().out == "walk-lerobot: 7 rows of torso in 2 episodes\n"
     assert json.loads(Path("walk-lerobot/meta/info.json").read_text())["fps"] == 10
     Path("joints.csv").write_text("time_s,hip,knee\n" + "".join(f"{n / 10},{n},{-n}\n" for n in range(10)))
     options = ["--window", "all", "--task", "walk", "--join", "action=joints.csv:knee", "--match", "nearest"]

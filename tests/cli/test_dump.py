@@ -129,7 +129,7 @@ def test_without_a_name_the_living_one_is_taken(capsys: pytest.CaptureFixture[st
         assert exit_status(command, ["-n", "1"]) == 0
         printed = capsys.readouterr()
         assert printed.out.startswith("dead #")
-        assert "driver 'dead' is dead; this is its last frame" in printed.err
+        assert "driver 'dead' is dead; this is its last snapshot" in printed.err
 
 
 @pytest.mark.parametrize(

@@ -378,7 +378,7 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
         out = text(capsys)
     lines = out.splitlines()
     assert re.fullmatch(r"namespace \S+: 1 driver, 0 services", lines[0])
-    assert re.fullmatch(r"driver torso: live, [\d.]+ Hz, newest data [\d.]+ ms old, frame 8, pid \d+", lines[2])
+    assert re.fullmatch(r"driver torso: live, [\d.]+ Hz, newest data [\d.]+ ms old, sample 8, pid \d+", lines[2])
     assert lines[3:5] == [
         "  fake driver: 2 patches, 8 modules, 96 sensors (uint8)",
         "  sensors: 80 pressure in counts, 16 temperature in degC",
@@ -392,9 +392,9 @@ def test_people_see_aligned_tables_with_units(capsys: pytest.CaptureFixture[str]
     assert re.fullmatch(r"  board 7  can0  live +41 of 48 +[\d.]+ ms +3 +640", lines[11])
     assert re.fullmatch(r"  board 8  can1  stale +0 of 48 +[\d.]+ ms +0 +0", lines[12])
     figure = r"[\d.]+ [mu]s"
-    takes = rf"  a frame takes {figure} to fill \(worst {figure}\); with all else {figure} of processor time"
+    takes = rf"  a sample takes {figure} to fill \(worst {figure}\); with all else {figure} of processor time"
     assert re.fullmatch(takes, lines[14])
-    assert re.fullmatch(r"  99 % of its frames are published at most [\d.]+ [a-z]+ after their newest data", lines[15])
+    assert re.fullmatch(r"  99 % of its samples are published at most [\d.]+ [a-z]+ after their newest data", lines[15])
     assert lines[16].split()[:3] == ["reader", "how", "pid"]
     assert "on demand" in lines[17]
     assert max(map(len, lines)) <= 100

@@ -30,12 +30,12 @@ def test_a_line_per_driver(capsys: pytest.CaptureFixture[str]) -> None:
     assert first.startswith("a  ")
     assert " Hz  age " in first
     assert "sensors 24 (fresh 24, stale 0)  patches 1 live  dropped 0  orphans 0" in first
-    assert second == "b  starting, no frame yet  sensors 768"
+    assert second == "b  starting, no sample yet  sensors 768"
 
 
 def test_plain_is_what_pipes_get(capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("a"):
-        assert lines(capsys, "-T", "0.01") == ["a  starting, no frame yet  sensors 768"]
+        assert lines(capsys, "-T", "0.01") == ["a  starting, no sample yet  sensors 768"]
 
 
 def test_nobody_runs(capsys: pytest.CaptureFixture[str], namespace: Namespace) -> None:

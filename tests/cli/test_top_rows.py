@@ -46,10 +46,10 @@ def test_a_plain_line() -> None:
     ("report", "words"),
     [
         (replace(REPORT, rate_hz=None), "roboskin  ? Hz  age 12 ms"),
-        (replace(REPORT, life="dead", rate_hz=0.0), "roboskin  DEAD, this is its last frame  age 12 ms"),
+        (replace(REPORT, life="dead", rate_hz=0.0), "roboskin  DEAD, this is its last sample  age 12 ms"),
         (replace(REPORT, life="silent"), "roboskin  SILENT, its process publishes nothing  age 12 ms"),
         (replace(REPORT, life="paused"), "roboskin  paused  age 12 ms"),
-        (replace(REPORT, life="starting", age_ns=None), "roboskin  starting, no frame yet  sensors 768"),
+        (replace(REPORT, life="starting", age_ns=None), "roboskin  starting, no sample yet  sensors 768"),
         (
             replace(REPORT, patches=(*[PATCH_REPORT] * 3, replace(PATCH_REPORT, state="stale"))),
             "patches 3 live, 1 stale  dropped 0",

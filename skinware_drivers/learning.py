@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from skinware.driver_service import DriverReader
 from skinware.errors import BusNotAvailable, ConfigurationError, MissingExtra
 from skinware.memory.namespace import Namespace
+from skinware_drivers.proving.captures import SnapshotLog
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.virtual.bus import BUSES
@@ -41,7 +41,6 @@ Action = npt.NDArray[np.float32]
 
 _LONGEST_START_S = 30.0
 _PICTURE = (480, 360)
-_NAME = "stepped"
 _ONE_TIME = threading.Lock()  # the package has one clock
 
 
@@ -108,20 +107,13 @@ class SkinEnv(gymnasium.Env[Observation, Action]):
         self._wire: _SteppedDriver | None = None
         if through_driver:
             self._wire = _SteppedDriver(driver, driver_options or {}, self._devices, self._period_ns / 1e9)
-        n = len(self._actuators)
-        limits = np.where(
-            self.scene.model.actuator_ctrllimited[self._actuators, None] == 1,
-            self.scene.model.actuator_ctrlrange[self._actuators],
-            (-np.inf, np.inf),
-        ).astype(np.float32)
-        self.action_space = gymnasium.spaces.Box(limits[:, 0], limits[:, 1])
-        lowest, highest = (each.astype(np.float32) for each in self._devices.limits)
-        self.observation_space = gymnasium.spaces.Dict(
-            {
-                "touch": gymnasium.spaces.Box(lowest, highest),
-                "position": gymnasium.spaces.Box(-np.inf, np.inf, (n,)),
-            }
-        )
+        box, model = gymnasium.spaces.Box, self.scene.model
+        is_limited = model.actuator_ctrllimited[self._actuators, np.newaxis] == 1
+        limits = np.where(is_limited, model.actuator_ctrlrange[self._actuators], (-np.inf, np.inf)).astype(np.float32)
+        self.action_space = box(*limits.T)
+        touch = box(*(each.astype(np.float32) for each in self._devices.limits))
+        position = box(-np.inf, np.inf, (len(limits),))
+        self.observation_space = gymnasium.spaces.Dict({"touch": touch, "position": position})
 
     # A task defines these
 
@@ -237,7 +229,8 @@ class _SteppedDriver:
         self._namespace = Namespace(f"stepped-{os.getpid()}-{secrets.token_hex(4)}")
         self._thread = ThreadPoolExecutor(1, "stepped driver")
         self._loop = HandLoop(self._clock)
-        self._reader: DriverReader | None = None
+        self._log = SnapshotLog(self._clock)
+        self._log.keep = False
         self._runner: Runner = self._now(lambda: self._make(driver, options))
         self._task = self._loop.create_task(self._runner.run())
         try:
@@ -271,7 +264,7 @@ class _SteppedDriver:
         adapter.check()
         hardware, size = self._devices.hardware, adapter.payload_size
         bus = BUSES[adapter.medium](driver, payload_size=size, hardware=hardware, clock=self._clock)
-        return Runner(driver, [(driver, adapter, bus)], name=_NAME, namespace=self._namespace)
+        return Runner(driver, [(driver, adapter, bus)], name=driver, namespace=self._namespace)
 
     def _begin(self) -> None:
         """Wait for all values, and compare those of taxels with what the devices felt."""
@@ -283,24 +276,21 @@ class _SteppedDriver:
             if fresh:
                 break
         else:
-            raise BusNotAvailable(f"{self._runner.identity.driver_type}: no values of all devices")
+            raise BusNotAvailable(f"{self._runner.identity.name}: no values of all devices")
         if (values != felt.ravel()[self._devices.rows]).any():
-            raise ConfigurationError(f"{self._runner.identity.driver_type} shows other numbers than its devices feel")
+            raise ConfigurationError(f"{self._runner.identity.name} shows other numbers than its devices feel")
 
     def _step(self) -> tuple[npt.NDArray[Any], bool]:
         begin_ns, rows = self._clock.now_ns, self._devices.rows
         self._loop.run_until_complete(asyncio.sleep(self._period_s))
         if self._task.done():
             self._task.result()
-        if self._reader is None and self._runner.builder.writer is not None:
-            self._reader = DriverReader(_NAME, namespace=self._namespace)
-        snapshot = None if self._reader is None else self._reader.latest()
-        if snapshot is None:
+        self._log.look(self._runner)
+        if not self._log.frames:
             return np.zeros(len(rows)), False
-        if len(snapshot.values) != self._devices.values.size:
-            raise ConfigurationError(
-                f"the driver has {len(snapshot.values)} sensors, its devices feel {self._devices.values.size}"
-            )
+        snapshot, n = self._log.frames[-1], self._devices.values.size
+        if len(snapshot.values) != n:
+            raise ConfigurationError(f"the driver has {len(snapshot.values)} sensors, its devices feel {n}")
         times_ns = snapshot.module_time_ns[snapshot.structure.sensor_module][rows]
         return snapshot.values[rows], bool((times_ns >= begin_ns).all())
 
@@ -308,5 +298,4 @@ class _SteppedDriver:
         self._runner.stop()
         self._loop.run_until_complete(asyncio.wait([self._task]))
         self._task.exception()
-        if self._reader is not None:
-            self._reader.close()
+        self._log.close()

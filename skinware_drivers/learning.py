@@ -49,7 +49,7 @@ class SkinEnv(gymnasium.Env[Observation, Action]):
 
     An action is the targets of actuators at the end of the step, in their units. An observation has
 
-    * ``touch``: (taxels,) float32, values as the devices send them, in the order of the binding's modules;
+    * ``touch``: (taxels,) float32, values as the devices send them, device by device;
     * ``position``: (actuators,) float32, rad or m.
 
     ``info`` has what is true: ``force_n`` (modules,), the normal force on each, N, ``slip_m_s``, the fastest contact,
@@ -111,7 +111,7 @@ class SkinEnv(gymnasium.Env[Observation, Action]):
         is_limited = model.actuator_ctrllimited[self._actuators, np.newaxis] == 1
         limits = np.where(is_limited, model.actuator_ctrlrange[self._actuators], (-np.inf, np.inf)).astype(np.float32)
         self.action_space = box(*limits.T)
-        touch = box(*(each.astype(np.float32) for each in self._devices.limits))
+        touch = box(*self._devices.limits.astype(np.float32))
         position = box(-np.inf, np.inf, (len(limits),))
         self.observation_space = gymnasium.spaces.Dict({"touch": touch, "position": position})
 
@@ -192,9 +192,8 @@ class _Devices:
 
     Attributes:
         values: (devices, n) int64, what all of them feel.
-        range: lowest and highest of those of a device, (n,) each.
         rows: (taxels,) where the bound ones are in all values.
-        limits: lowest and highest of those, (taxels,) each.
+        limits: (2, taxels) lowest and highest of those.
     """
 
     def __init__(self, world: PhysicsWorld, driver: str, options: Mapping[str, Any]) -> None:
@@ -206,9 +205,11 @@ class _Devices:
         self.numbers = list(self.hardware.numbers)
         n = len(self.hardware.places())
         self.rows = world.rows(self.numbers, n)
-        self.range = tuple(each_value(name, getattr(self.hardware, name), n) for name in ("lowest", "full_scale"))
-        self.limits = tuple(np.tile(each, len(self.numbers))[self.rows] for each in self.range)
-        self.values = np.zeros((len(self.numbers), n), np.int64)
+        self.values, *limits = (
+            np.tile(each_value(name, getattr(self.hardware, name), n), (len(self.numbers), 1))
+            for name in ("rest", "lowest", "full_scale")
+        )
+        self.limits = np.array([each.ravel()[self.rows] for each in limits])
 
     def feel(self, world: PhysicsWorld, time_ns: int) -> npt.NDArray[np.int64]:
         """Let the world run to a time; return (taxels,) values."""
@@ -268,16 +269,16 @@ class _SteppedDriver:
 
     def _begin(self) -> None:
         """Wait for all values, and compare those of taxels with what the devices felt."""
-        felt = self._devices.values
-        lowest, highest = self._devices.range
-        felt[:] = lowest + (37 * np.arange(felt.size).reshape(felt.shape) + 11) % (highest - lowest + 1)
+        lowest, highest = self._devices.limits
+        felt = lowest + (37 * np.arange(len(lowest)) + 11) % (highest - lowest + 1)
+        self._devices.values.ravel()[self._devices.rows] = felt
         for _ in range(round(_LONGEST_START_S / self._period_s)):
             values, fresh = self.step()
             if fresh:
                 break
         else:
             raise BusNotAvailable(f"{self._runner.identity.name}: no values of all devices")
-        if (values != felt.ravel()[self._devices.rows]).any():
+        if (values != felt).any():
             raise ConfigurationError(f"{self._runner.identity.name} shows other numbers than its devices feel")
 
     def _step(self) -> tuple[npt.NDArray[Any], bool]:

@@ -163,13 +163,16 @@ class PhysicsWorld:
         self.scene = PhysicsScene(bound)
         self._speed = speed
         self._bound = bound
-        self._of_device: dict[int, list[tuple[int, int]]] = {}  # device -> modules, and their first values
+        # device -> modules, and by axis which values of the device are theirs
+        self._of_device: dict[int, list[tuple[int, list[tuple[slice, int]]]]] = {}
         next_value: dict[int, int] = {}
         for number, module in enumerate(self.scene.modules):
             device, axes = module.binding.device, module.binding.axes
             first = next_value.get(device, 0) if module.binding.first is None else module.binding.first
-            next_value[device] = first + len(axes) * len(module.position_m)
-            self._of_device.setdefault(device, []).append((number, first))
+            end = next_value[device] = first + len(axes) * len(module.position_m)
+            rows = [(slice(first + place, end, len(axes)), axis) for place, axis in enumerate(map(_AXES.find, axes))]
+            felt = [(values, axis) for values, axis in rows if axis >= 0]
+            self._of_device.setdefault(device, []).append((number, felt))
         self._ends = next_value
         self._has_services = has_services
         self._services: WorldServices | None = None
@@ -227,25 +230,21 @@ class PhysicsWorld:
         """
         self.advance(time_ns)
         values = np.zeros(n_values)
-        for module, first in self._of_device.get(device, []):
+        for module, felt in self._of_device.get(device, []):
             counts = self._transfers[module].counts(self.forces()[module], self.since_s(time_ns))
-            axes = self.scene.modules[module].binding.axes
-            for place, axis in enumerate(axes):
-                if axis in _AXES:
-                    rows = slice(first + place, first + len(axes) * len(counts), len(axes))
-                    values[rows] = counts[:, _AXES.index(axis)]
+            for rows, axis in felt:
+                values[rows] = counts[:, axis]
         return values
 
     def rows(self, numbers: Sequence[int], n_values: int) -> npt.NDArray[np.int64]:
-        """Return (n,) where the values of taxels are among those of all devices, module by module."""
+        """Return (n,) which values of all devices are those of taxels, ascending."""
         self.fit(numbers, n_values)
-        found = []
-        for device, modules in self._of_device.items():
-            for module, first in modules:
-                taxels = self.scene.modules[module]
-                felt = np.tile([axis in _AXES for axis in taxels.binding.axes], len(taxels.position_m))
-                found.append(list(numbers).index(device) * n_values + first + np.flatnonzero(felt))
-        return np.concatenate(found)
+        is_felt = np.zeros((len(numbers), n_values), bool)
+        for place, device in enumerate(numbers):
+            for _, felt in self._of_device.get(device, []):
+                for rows, _ in felt:
+                    is_felt[place, rows] = True
+        return np.flatnonzero(is_felt)
 
     def close(self) -> None:
         self.scene.close()

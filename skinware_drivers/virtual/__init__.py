@@ -2,7 +2,7 @@
 
 from skinware_drivers.adapter import VirtualAdapter
 from skinware_drivers.virtual.device import Device, EmulatorOptions
-from skinware_drivers.virtual.emulator import CanFrame, Emulator, Places, on_a_grid
+from skinware_drivers.virtual.emulator import CanFrame, Emulator, Places, on_a_grid, on_pads
 from skinware_drivers.virtual.serial_device import ModbusEmulator, SerialEmulator, SerialEmulatorOptions, cut_packets
 
 __all__ = [
@@ -17,4 +17,5 @@ __all__ = [
     "VirtualAdapter",
     "cut_packets",
     "on_a_grid",
+    "on_pads",
 ]

@@ -203,7 +203,7 @@ class EmulatorOptions(Options, frozen=True, forbid_unknown_fields=True, kw_only=
 
     pattern: Annotated[
         Literal["touch", "idle", "cycle"],
-        Meta(description="input: a wandering press, nothing, or each burst's number in every value"),
+        Meta(description="input: a finger that presses here and there, nothing, or each burst's number in every value"),
     ] = "touch"
     calm_s: Annotated[Seconds, Meta(description="seconds without touch at the begin")] = 0.0
     seed: Annotated[Count, Meta(description="seed of the touch and of the random faults")] = 0

@@ -25,7 +25,7 @@ from skinware_drivers.virtual.stage import OptionsT, Stage
 CanFrame = tuple[int, bytes]
 """Identifier and payload; an identifier of 29 bits has the flag, as in ``EXTENDED_FLAG | 0x18DA00F1``."""
 Places = npt.NDArray[np.float64]
-"""(n, 2) places of the values of a device, 0 to 1."""
+"""(n, 3) places of the values of a device: x and y on a pad, 0 to 1, and the number of the pad; (n, 2): on one pad."""
 Source = Callable[[int, int], Sequence[int]]
 """(number of the device, number of its burst) -> the values that it sends, instead of felt ones."""
 
@@ -33,12 +33,15 @@ _FOREIGN_IDENTIFIERS = 40
 _PRESS_S, _PAUSE_S, _RAMP_S = 2.6, 1.4, 0.5
 _PRESSES, _REST_S = 6, 6.0
 """Presses in a row, and the rest after them, in which a baseline can begin."""
-_RADIUS = 0.22
-"""Radius of the pressed spot; the device is 1 wide."""
+_REACH, _STROKE = 2.2, 1.0
+"""Radius of the pressed spot, and half the way that it strokes, in rows and columns."""
+_COARSEST = 0.25
+"""Most that a row or column counts; a pad is 1 wide."""
+_GOLDEN = 0.618
 
 
 class WanderingPress:
-    """A wandering press on one device.
+    """A finger that presses one pad of a device after another, each time somewhere else, and strokes it a little.
 
     Args:
         number: of the device; devices with other numbers feel other presses.
@@ -46,21 +49,27 @@ class WanderingPress:
 
     def __init__(self, seed: int, number: int, places: Places) -> None:
         random = np.random.default_rng([seed, number, 3])
-        self._phase = random.uniform(0, 9)
+        self._phase = random.uniform(0, 1)
         self._first_s = random.uniform(0, _PAUSE_S)
-        self._places = places
+        self._places = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
+        self._pads = [np.flatnonzero(self._places[:, 2] == pad) for pad in np.unique(self._places[:, 2])]
 
     def strength(self, time_s: float) -> npt.NDArray[np.float64]:
         """Return (n,) strengths, 0 to 1, at a time since the device began to send."""
         since_s = time_s - self._first_s
-        in_round_s = since_s % (_PRESSES * (_PRESS_S + _PAUSE_S) + _REST_S)
-        is_pressing = since_s > 0 and in_round_s < _PRESSES * (_PRESS_S + _PAUSE_S)
-        moment_s = in_round_s % (_PRESS_S + _PAUSE_S)
-        ramp = min(max(min(moment_s, _PRESS_S - moment_s) / _RAMP_S, 0.0), 1.0) if is_pressing else 0.0
-        at = time_s + self._phase
-        centre = 0.5 + 0.4 * np.array([math.sin(0.71 * at), math.sin(0.53 * at + 1)])
-        distance2 = ((self._places - centre) ** 2).sum(axis=1)
-        strength: npt.NDArray[np.float64] = ramp * np.exp(distance2 * (-0.5 / _RADIUS**2))
+        rounds, in_round_s = divmod(since_s, _PRESSES * (_PRESS_S + _PAUSE_S) + _REST_S)
+        press, moment_s = divmod(in_round_s, _PRESS_S + _PAUSE_S)
+        strength = np.zeros(len(self._places))
+        if since_s <= 0 or press >= _PRESSES or moment_s >= _PRESS_S:
+            return strength
+        presses = int(rounds) * _PRESSES + int(press)
+        pad = self._pads[presses % len(self._pads)]
+        at = (self._phase + presses * _GOLDEN) % 1
+        away = self._places[pad, :2] - self._places[pad[int(at * len(pad))], :2]
+        away /= np.abs(away).min(axis=0, initial=_COARSEST, where=away != 0)
+        away -= _STROKE * (2 * moment_s / _PRESS_S - 1) * np.array([math.cos(9 * at), math.sin(9 * at)])
+        ramp = min(min(moment_s, _PRESS_S - moment_s) / _RAMP_S, 1.0)
+        strength[pad] = ramp * np.maximum(0, 1 - (away**2).sum(axis=1) / _REACH**2)
         return strength
 
 
@@ -104,7 +113,7 @@ class Emulator(Stage[OptionsT]):
 
     @abstractmethod
     def places(self) -> Places:
-        """Return the places of a device's values; see :func:`on_a_grid`."""
+        """Return the places of a device's values; see :func:`on_a_grid` and :func:`on_pads`."""
 
     @abstractmethod
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:
@@ -219,8 +228,16 @@ def each_value(name: str, given: int | Sequence[int], n_values: int) -> npt.NDAr
 
 
 def on_a_grid(count: int, columns: int, each: int = 1) -> Places:
-    """Return (count * each, 2) places of sensors in rows, with ``each`` at the same place."""
+    """Return (count * each, 3) places of sensors in rows on one pad, with ``each`` at the same place."""
     number = np.arange(count)
     rows = -(-count // columns)
-    places = np.stack([(number % columns + 0.5) / columns, (number // columns + 0.5) / rows], axis=1)
-    return np.repeat(places, each, axis=0)
+    x, y = (number % columns + 0.5) / columns, (number // columns + 0.5) / rows
+    return np.repeat(np.stack([x, y, np.zeros(count)], axis=1), each, axis=0)
+
+
+def on_pads(*shapes: tuple[int, int], each: int = 1) -> Places:
+    """Return the places of sensors on several pads, of so many sensors in so many columns; no finger presses two."""
+    pads = [on_a_grid(*shape, each) for shape in shapes]
+    for number, pad in enumerate(pads):
+        pad[:, 2] = number
+    return np.concatenate(pads)

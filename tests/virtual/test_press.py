@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skinware_drivers.virtual import on_a_grid
+from skinware_drivers.virtual import on_a_grid, on_pads
 from skinware_drivers.virtual.emulator import WanderingPress
 
 
@@ -18,3 +18,31 @@ def test_a_device_is_touched_and_then_rests_for_longer_than_a_baseline_takes() -
     assert sum(rest_s > 6 for rest_s in rests_s) == 2
     assert min(np.diff(ends_s)) > 3
     assert len(ends_s) >= 12
+
+
+def test_a_finger_presses_one_pad_after_another_and_a_few_taxels_that_hang_together() -> None:
+    shapes = [(96, 8), (9, 3), (112, 14)]
+    pad = np.repeat([0, 1, 2], [count for count, _ in shapes])
+    press = WanderingPress(0, 1, on_pads(*shapes))
+    pressed: list[int] = []
+    for time_s in np.arange(0, 30, 0.1):
+        taxels = np.flatnonzero(press.strength(time_s))
+        if not len(taxels):
+            continue
+        [on] = set(pad[taxels].tolist())
+        row, column = np.divmod(taxels - np.flatnonzero(pad == on)[0], shapes[on][1])
+        assert np.ptp(row) <= 4
+        assert np.ptp(column) <= 4
+        pressed += [on] if not pressed or pressed[-1] != on else []
+    assert pressed == [0, 1, 2] * 2
+
+
+def test_a_part_without_neighbours_is_pressed_alone() -> None:
+    press = WanderingPress(0, 1, on_pads(*[(1, 1)] * 4))
+    assert {np.count_nonzero(press.strength(time_s)) for time_s in np.arange(0, 20, 0.1)} == {0, 1}
+
+
+def test_places_without_pads_are_one_pad() -> None:
+    press = WanderingPress(0, 1, on_a_grid(16, 4)[:, :2])
+    assert np.array_equal(press.strength(2.0), WanderingPress(0, 1, on_a_grid(16, 4)).strength(2.0))
+    assert press.strength(2.0).max() > 0.9

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_pads
 
 _ASKED = "asked"  # in the memory of a device: the command to be answered
 _MOVES = "moves"  # commands to move so far
@@ -40,7 +40,7 @@ class EmulatedAbilityHand(SerialEmulator[EmulatedAbilityHandOptions]):
     streams = "never"
 
     def places(self) -> Places:
-        return on_a_grid(30, 6)
+        return on_pads(*[(6, 2)] * 5)
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         *parts, rest = heard.split(b"~")

@@ -13,7 +13,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_pads
 
 _DEVICE, _TYPE = 7, 0x0203
 _BAD_CHECKSUM, _UNKNOWN, _NO_SUCH_SENSOR = 0xF0, 0xF1, 0xF2
@@ -38,7 +38,7 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
     swing = 3500
 
     def places(self) -> Places:
-        return on_a_grid(sum(self.options.sensors), 4)
+        return on_pads(*[(count, 4) for count in self.options.sensors])
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         return cut_packets(heard, b"\xf0\xc4", _total)

@@ -19,10 +19,11 @@ from skinware_drivers.virtual import (
     Places,
     SerialEmulator,
     SerialEmulatorOptions,
-    on_a_grid,
+    on_pads,
 )
 
 _JOINTS = 16
+_PADS = (1, 1), (3, 1), (4, 1), (4, 1), (4, 1)
 
 
 class EmulatedAllegroV5Options(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -41,7 +42,7 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
     streams = "always"
 
     def places(self) -> Places:
-        return on_a_grid(16, 4)
+        return on_pads(*_PADS)
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         return [(0x054 << 2, bytes(values[:8])), (0x055 << 2, bytes(values[8:]))]
@@ -62,7 +63,7 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
     streams = "always"
 
     def places(self) -> Places:
-        return on_a_grid(4, 4)
+        return on_pads(*[(1, 1)] * 4)
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         pascals = [value + self.options.air_pa for value in values]
@@ -84,7 +85,7 @@ class EmulatedAllegroV5Udp(SerialEmulator[EmulatedAllegroV5UdpOptions]):
     streams = "always"
 
     def places(self) -> Places:
-        return on_a_grid(16, 4)
+        return on_pads(*_PADS)
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         number = device.cycle & 0xFFFF_FFFF

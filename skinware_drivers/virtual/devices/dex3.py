@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_pads
 
 _PADS = 9
 _PRESSURE, _TEMPERATURE = (100_000,) * 12, (25,) * 12
@@ -38,8 +38,8 @@ class EmulatedDex3(SerialEmulator[EmulatedDex3Options]):
     numbered_by = "hands"
 
     def places(self) -> Places:
-        cells = on_a_grid(12 * _PADS, 12).reshape(_PADS, 12, 2)
-        return np.concatenate([cells, cells], axis=1).reshape(-1, 2)
+        cells = on_pads(*[(12, 4)] * _PADS).reshape(_PADS, 12, 3)
+        return np.concatenate([cells, cells], axis=1).reshape(-1, 3)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         return f"hand{payload[6]}" if len(payload) > 6 else ""

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_pads
 
 _ROOM = 24
 
@@ -41,7 +41,7 @@ class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
     numbered_by = "boards"
 
     def places(self) -> Places:
-        return on_a_grid(12 * self.options.triangles, 12)
+        return on_pads(*[(12, 4)] * self.options.triangles)
 
     def kinds(self) -> Sequence[str]:
         """Name the CAN frames that the board's datagrams carry."""

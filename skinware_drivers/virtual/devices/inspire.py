@@ -8,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
-import numpy as np
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_pads
 
 _FINGER = ((3, 3), (12, 8), (10, 8))
 _THUMB = ((3, 3), (12, 8), (3, 3), (12, 8))
@@ -37,17 +36,7 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
     numbered_by = "unit"
 
     def places(self) -> Places:
-        """Return places of fingers side by side, the little one left, each from its tip down; the palm is below."""
-        found = []
-        for finger in range(5):
-            shapes = _THUMB if finger == 4 else _FINGER
-            rows = sum(rows for rows, _ in shapes)
-            above = 0
-            for n_rows, n_columns in shapes:
-                found.append(_spread(n_rows, n_columns, (finger / 5, 0.7 * above / rows), (0.15, 0.7 * n_rows / rows)))
-                above += n_rows
-        found.append(_spread(*_PALM, (0.0, 0.72), (1.0, 0.28)))
-        return np.concatenate(found)
+        return on_pads(*[(rows * columns, columns) for rows, columns in _SHAPES])
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:  # noqa: ARG002
         """Return the registers from 3000 on, two addresses each."""
@@ -63,10 +52,3 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
         if self.options.swapped:
             sent = [value >> 8 | (value & 0xFF) << 8 for value in sent]
         return {3000 + 2 * number: value for number, value in enumerate(sent)}
-
-
-def _spread(rows: int, columns: int, corner: tuple[float, float], size: tuple[float, float]) -> Places:
-    """Return (rows * columns, 2) places in a rectangle, row by row."""
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    share = np.stack([(column + 0.5) / columns, (row + 0.5) / rows], axis=1)
-    return np.array(corner) + share * size

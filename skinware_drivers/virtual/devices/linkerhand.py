@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from msgspec import Meta
 
-from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_a_grid
+from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_pads
 
 _SIZES = {"12x6": (12, 6), "10x4": (10, 4)}
 _OF_HAND = {"hand_23x9": ((23, 9), (28, 20)), "hand_12x6": ((12, 6), (14, 16))}
@@ -55,9 +56,8 @@ class EmulatedLinkerHand(Emulator[EmulatedLinkerHandOptions]):
 
     def places(self) -> Places:
         if self.options.touch in _FIRST:
-            return on_a_grid(20, 5)
-        cells = sum(rows * columns for rows, columns in map(self._size, self._commands))
-        return on_a_grid(cells, round(cells**0.5))
+            return np.tile(on_pads(*[(1, 1)] * 5), (4, 1))
+        return on_pads(*[(rows * columns, columns) for rows, columns in map(self._size, self._commands)])
 
     def boot(self, device: Device, now_ns: int) -> None:
         if self.options.program_ms or self.options.streaming:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_pads
 
 _TAXELS = 12
 _SHORTEST_US, _LONGEST_US = 1000, 1_000_000
@@ -89,7 +89,7 @@ class EmulatedOpenPatch(SerialEmulator[EmulatedOpenPatchOptions]):
         self._crc = zlib.crc32(b"".join(self._items))
 
     def places(self) -> Places:
-        return on_a_grid(_TAXELS * self.options.modules, _TAXELS)
+        return on_pads(*[(_TAXELS, 4)] * self.options.modules)
 
     def boot(self, device: Device, now_ns: int) -> None:
         is_first = "reset" not in device.memory and device.cycle == 0

@@ -58,14 +58,14 @@ class EmulatedPapillArray(SerialEmulator[EmulatedPapillArrayOptions]):
         n = options.pillars
         self._n = _AXES * n + _WHOLE + 2 * n + 3
         self._edges = np.cumsum([_AXES * n, _WHOLE, n, n]).tolist()
-        self._arms_mm = (on_a_grid(n, 3).T - 0.5) * _WIDTH_MM
+        self._arms_mm = (on_a_grid(n, 3)[:, :2].T - 0.5) * _WIDTH_MM
         for name in _RANGES:
             setattr(self, name, _each(name, options.sensors, n))
         super().__init__(options, **more)
 
     def places(self) -> Places:
         n = self.options.pillars
-        pillars, whole = on_a_grid(n, 3), np.full((1, 2), 0.5)
+        pillars, whole = on_a_grid(n, 3), np.array([[0.5, 0.5, 0.0]])
         of_sensor = [
             np.repeat(pillars, _AXES, axis=0),
             np.repeat(whole, _WHOLE, axis=0),

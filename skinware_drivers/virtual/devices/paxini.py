@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_pads
 
 _LONGEST_COMMAND = 64
 _NO_COMMAND = 2
@@ -70,7 +70,7 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
     def places(self) -> Places:
         options = self.options
         modules = [options.points] if options.board == "converter" else [self.points_of(slot) for slot in options.slots]
-        return on_a_grid(sum(modules), 8, each=3)
+        return on_pads(*[(points, max(1, round(0.85 * points**0.5))) for points in modules], each=3)
 
     def text(self) -> str:
         return self.options.sensor_version

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid, on_pads
 from skinware_drivers.virtual.serial_device import text_registers
 
 _EDITIONS = {"touch": 1, "pressure": 2, "array_pressure": 3, "force3d": 4}
@@ -65,7 +65,7 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
 
     def places(self) -> Places:
         if self.options.edition == "touch":
-            return np.concatenate([on_a_grid(5, 5, each=3), on_a_grid(5, 5)])
+            return np.concatenate([on_pads(*[(1, 1)] * 5, each=3), on_pads(*[(1, 1)] * 5)])
         return on_a_grid(_N_VALUES[self.options.edition], 12)
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:

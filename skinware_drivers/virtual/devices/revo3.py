@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid, on_pads
 from skinware_drivers.virtual.serial_device import text_registers
 
 _PRESSURE = {
@@ -64,7 +64,7 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
         super().__init__(options, **more)
 
     def places(self) -> Places:
-        return on_a_grid(42 if self.options.sums else sum(self._points), 16)
+        return on_a_grid(42, 16) if self.options.sums else on_pads(*[(points, 6) for points in self._points])
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
         """Return the registers of the data; those of no pad are 0."""

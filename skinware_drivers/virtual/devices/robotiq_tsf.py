@@ -41,7 +41,7 @@ class EmulatedRobotiqTsf(SerialEmulator[EmulatedRobotiqTsfOptions]):
     numbered_by = "fingers"
 
     def places(self) -> Places:
-        return np.concatenate([on_a_grid(28, 4), np.full((11, 2), 0.5)])
+        return np.concatenate([on_a_grid(28, 4), [[0.5, 0.5, 0.0]] * 11])
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         return cut_packets(heard, b"\x9a\0", lambda part: 4 + part[3] if len(part) > 3 else 0)

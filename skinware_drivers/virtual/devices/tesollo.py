@@ -11,7 +11,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_pads
 
 _MOTORS_AND_FINGERS = {"1f": (3, 1), "2f": (6, 2), "3f": (12, 3), "4f": (18, 4), "5f": (20, 5), "5f15": (15, 5)}
 
@@ -49,7 +49,7 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
 
     def places(self) -> Places:
         count = _TIPS[self.options.tips].n_values
-        return on_a_grid(len(self._fitted) * count, count)
+        return on_pads(*[(count, max(1, count // 3))] * len(self._fitted))
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         return cut_packets(heard, b"\0", lambda part: max(3, part[1]) if len(part) > 1 else 0)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_pads
 from skinware_drivers.virtual.devices.weiss_wts import BEGIN, crc, cut_commands
 
 _OK, _WRONG = 0, 1
@@ -33,7 +33,7 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
     swing = 3500
 
     def places(self) -> Places:
-        return on_a_grid(sum(6 * rows for rows in self._rows), 6)
+        return on_pads(*[(6 * rows, 6) for rows in self._rows])
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         return cut_commands(heard, bare_when_empty=True)

@@ -48,7 +48,7 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
         self.identifiers: Collection[int] = taxels.union(range(0x200, 0x210))  # commands
 
     def places(self) -> Places:
-        return on_a_grid(16, 4, each=3) if self.options.model == "4x4" else on_a_grid(24, 6, each=3)
+        return on_a_grid(16 if self.options.model == "4x4" else 24, 4, each=3)
 
     def obey(self, device: Device, identifier: int, payload: bytes, now_ns: int) -> bool:
         if identifier != 0x200 + device.number or payload not in (b"\x07\x00", b"\x07\x01"):

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
+from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_pads
 
 _BOOT_TIME_S = 1_700_000_000.0
 _TAGS = {3: 256 + 10, 4: 256 + 20}
@@ -35,7 +35,7 @@ class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
     streams = "always"
 
     def places(self) -> Places:
-        return on_a_grid(self.options.length, 12)
+        return on_pads(*[(min(12, self.options.length - first), 4) for first in range(0, self.options.length, 12)])
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """Return one vector, as in YARP's binary carriers."""

@@ -22,9 +22,14 @@ import numpy as np
 from msgspec import Meta
 
 from skinware.errors import ConfigurationError
+from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
 from skinware_drivers import Bits, Frame, Identifier, Layout, Link, Module, Options, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
+from skinware_drivers.hand import Grid, Place
+
+_PITCH_M = 0.0047
+_AXES = ("shear_x", "shear_y", "pressure")
 
 
 class XelaOptions(Options, frozen=True):
@@ -63,6 +68,17 @@ class XelaOptions(Options, frozen=True):
             return [first + taxel for taxel in range(self.rows * self.columns)]
         return [first | row << 4 | column for column in range(self.columns) for row in range(self.rows)]
 
+    def geometry(self) -> Geometry:
+        """Return nominal places: a grid for each board, at the pitch of the models whose pitch is published."""
+        grid, numbers = Grid(self.rows, self.columns, _PITCH_M), np.arange(self.rows * self.columns)
+        cells = numbers if self.ids == "consecutive" else numbers % self.rows * self.columns + numbers // self.rows
+        return Geometry.joined(
+            [
+                grid.at(Place(f"board_{b}_nominal"), _AXES, (b << 16 | numbers).tolist(), cells.tolist())
+                for b in self.boards
+            ]
+        )
+
 
 class XelaDriver(CanAdapter[XelaOptions]):
     """uSkin boards, a patch each. Each taxel is a module of three sensors with one uid = board << 16 | taxel.
@@ -77,11 +93,12 @@ class XelaDriver(CanAdapter[XelaOptions]):
         super().__init__(options)
         ids = {b: options.identifiers(first) for b, first in zip(options.boards, options.first_id, strict=True)}
         axes = Values(offset=1, dtype=">u2", count=3)
+        self.geometry = options.geometry()
         patches, frames = [], []
         for board, own in ids.items():
             first_uid = board << 16
             modules = [
-                Module(taxels(1, "shear_x", "shear_y", "pressure", first_uid=first_uid | taxel), identifier, "taxel")
+                Module(taxels(1, *_AXES, first_uid=first_uid | taxel), identifier, "taxel")
                 for taxel, identifier in enumerate(own)
             ]
             patches.append(Patch(f"board {board}", modules, key=board))

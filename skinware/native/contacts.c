@@ -122,7 +122,7 @@ static void measure_contacts(struct contacts *c) {
         f->uncertainty[k] = c->has_uncertainty ? 0 : NAN;
         f->clipped[k] = 0;
         f->n[k] = 0;
-        f->frames[k] = 1;
+        f->frames[k] = !c->has_uncertainty;
         f->is_sure[k] = !c->has_onset;
         for (axis = 0; axis < 3; axis++)
             f->cop_m[3 * k + axis] = f->normal[3 * k + axis] = -0.0;
@@ -146,6 +146,8 @@ static void measure_contacts(struct contacts *c) {
             f->normal[3 * contact + axis] += weight * of_taxel[3 + axis];
         }
         f->n[contact]++;
+        if (c->has_uncertainty && load >= CLEAR * c->uncertainty[taxel] && f->frames[contact] < 1)
+            f->frames[contact] = 1;
         if (c->has_onset) {
             f->is_sure[contact] |= c->touched[taxel];
             if (c->onset[taxel])

@@ -13,6 +13,7 @@
 #define LEAST_SHARE 0.1    /* share of the newest frame in the value of a taxel that is just touched */
 #define LEAST_SEEN 0.5     /* least share of a load that must be above the threshold, for an estimate */
 #define MOST_CUT 0.6       /* largest share of clipped taxels, for the same */
+#define CLEAR 4.0          /* uncertainties of a value that speaks for a contact: between those of a touch's begin and end */
 
 #define SLIP_SIGMA 5.0     /* standard deviations of its noise by which a pattern must have moved: by chance once an hour */
 #define CREEP_M_S 0.0005   /* speed of a pattern whose object creeps or whose elastomer settles */
@@ -46,7 +47,7 @@ struct slips {
 struct found { /* the contacts of a frame, before they are listed */
     double *load, *peak, *area_m2, *force_n, *load_whole, *uncertainty, *clipped;
     double *cop_m, *normal;
-    int64_t *n, *frame, *frames; /* frames: how many frames speak for it */
+    int64_t *n, *frame, *frames; /* frames: how many frames speak for it; 0: its values are not clear */
     uint8_t *is_sure;
     int64_t *id, *kind; /* from here on as the tracks say */
     double *age_s, *velocity_m_s;

@@ -102,7 +102,7 @@ void skinware_tracks_judge(struct track *tracks, int64_t n, const struct track *
         const int is_new = i >= n_before;
         const double passed_s = !is_new && time_ns > before[i].seen_ns ? (double)(time_ns - before[i].seen_ns) / 1e9 : 0;
         const double weight = is_new ? 1 : passed_share(passed_s, velocity_s);
-        const double alone = t->shared ? 0 : fmax(weight, 1 / (double)t->frames);
+        const double alone = t->shared ? 0 : fmax(weight, 1 / fmax((double)t->frames, 1));
         const double calm = passed_share(passed_s, CALM * velocity_s);
         const double measured = pitch_m * sqrt(t->now / (TWO_PI * fmax(t->height, 1e-9)));
         int is_sliding;

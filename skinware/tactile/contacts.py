@@ -142,7 +142,6 @@ class ContactSet:
         return self[int(rows[np.argmax(self.load[rows])])] if len(rows) else None
 
 
-_WHOLE = "estimate of the load with what threshold and clipping cut off; NaN: most of it is"
 COLUMNS: Columns = {
     "id": ("<u4", (), "", "the same as long as the contact lasts; 0: this row is empty"),
     "age_s": ("<f4", (), "s", "since it began"),
@@ -150,7 +149,7 @@ COLUMNS: Columns = {
     "peak": ("<f4", (), None, "the largest of them"),
     "area_m2": ("<f4", (), "m2", "that its taxels stand for"),
     "force_n": ("<f4", (), "N", "of values in N, or of pressures in Pa by area"),
-    "load_whole": ("<f4", (), None, _WHOLE),
+    "load_whole": ("<f4", (), None, "the load with what threshold and clipping cut off, estimated; NaN: most of it is"),
     "uncertainty": ("<f4", (), None, "how much of the load could be noise or drift; NaN: not known"),
     "n": ("<u4", (), "", "number of its taxels"),
     "clipped": ("<u4", (), "", "number of its taxels that are at the end of their range"),

@@ -65,12 +65,12 @@ class TrackingSettings:
     """Settings of the tracking of contacts.
 
     Attributes:
-        frames: in how many frames it must be seen before it is a contact.
+        frames: in how many frames it must be clear, by 4 times the uncertainty of a value, before it is a contact.
         patience_s: how long an identity is kept while its contact is gone, s.
         pitch_m: pitch of the taxels, m; None: that of their places. A contact may be 2.3 pitches from its expected
             place; one expected to move farther than a pitch in a frame is judged by its place first.
         velocity_s: time constant of the velocity, and of the steady load, s.
-        touch_s: how long a contact is a touch, s.
+        touch_s: how long a contact is a touch, and after which it needs not be clear, s.
         sliding_m_s: speed from which it is sliding, until it falls below half of it, m/s.
         steady: share by which the load of a sliding contact may differ from its steady load.
     """
@@ -203,7 +203,7 @@ class Tracker:
 
     def _join(self, home: Whole, overlap: Doubles, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> None:
         """Put tracks that found no blob of their own into that of another."""
-        lost = np.flatnonzero((home < 0) & (expected["frames"] > 1) & np.isfinite(expected["place"][:, 0]))
+        lost = np.flatnonzero((home < 0) & (expected["id"] > 0) & np.isfinite(expected["place"][:, 0]))
         if not len(lost) or not len(size) or len(lost) > _MOST_NEW:
             return
         within = np.bincount(home[home >= 0], minlength=len(size))
@@ -311,7 +311,9 @@ class Tracker:
         here = here[np.lexsort([tracks["key"][here], tracks["born_ns"][here], tracks["home"][here]])]
         home = tracks["home"][here]
         first = here[np.diff(home, prepend=-1) > 0]
-        new = first[(tracks["id"][first] == 0) & (tracks["frames"][first] >= self._settings.frames)]
+        age_s = (time_ns - tracks["born_ns"][first]) / NS_PER_S
+        is_known = (tracks["frames"][first] >= self._settings.frames) | (age_s >= self._settings.touch_s)
+        new = first[(tracks["id"][first] == 0) & is_known]
         tracks["id"][new] = (self._last_id + np.arange(len(new))) % _LAST_ID + 1
         self._last_id = (self._last_id + len(new) - 1) % _LAST_ID + 1 if len(new) else self._last_id
         velocity = tracks["velocity"][first]
@@ -321,7 +323,7 @@ class Tracker:
             velocity[blob] = weight @ tracks["velocity"][rows] / weight.sum()
         return {
             "id": tracks["id"][first],
-            "age_s": (time_ns - tracks["born_ns"][first]) / NS_PER_S,
+            "age_s": age_s,
             "velocity_m_s": velocity,
             "kind": tracks["kind"][first],
             "provisional": ~tracks["sure"][first],

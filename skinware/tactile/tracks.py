@@ -70,7 +70,7 @@ class TouchedBlobs:
         frame: (m,) int64, number of its coordinate frame, -1 for none.
         cop_m: (m, 3) m, its centre; NaN if it is not known.
         is_sure: (m,) bool, whether any of its taxels is touched for sure.
-        frames: (m,) int64, how many frames speak for it: 2 where a taxel has an onset.
+        frames: (m,) int64, how many frames speak for it: 2 where a taxel has an onset, 0 where no value is clear.
     """
 
     taxels: Whole

@@ -16,7 +16,7 @@ from skinware.tactile.tracking import Tracker
 from skinware.tactile.tracks import TouchedBlobs
 
 CLEARLY, LEAST_SHARE = 1.5, 0.1
-LEAST_SEEN, MOST_CUT = 0.5, 0.6
+LEAST_SEEN, MOST_CUT, CLEAR = 0.5, 0.6, 4.0
 
 
 class SpecifiedComponents:
@@ -115,7 +115,8 @@ class SpecifiedContacts:
             count = MOST
         found = self._measure(taxels, contact, load, count)
         is_sure = np.bincount(contact, touched[taxels], count) > 0
-        frames = 1 + (np.bincount(contact, onset[taxels], count) > 0)
+        is_clear = np.bincount(contact, load >= CLEAR * uncertainty[taxels], count) > 0
+        frames = np.where(np.bincount(contact, onset[taxels], count) > 0, 2, is_clear.astype(np.int64))
         blobs = TouchedBlobs(
             taxels, contact, load, found["load"], found["peak"], found["frame"], found["cop_m"], is_sure, frames
         )

@@ -78,7 +78,7 @@ def judge(tracks: Tracks, before: Tracks, time_ns: int, settings: TrackingSettin
     width: Doubles = now["width"]
     motion: Doubles = now["motion"]
     frames: Whole = now["frames"]
-    alone = np.maximum(weight, 1 / frames) * ~now["shared"]
+    alone = np.maximum(weight, 1 / np.maximum(frames, 1)) * ~now["shared"]
     calm = -np.expm1(-passed_s / (CALM * settings.velocity_s))[:, None]
     load += weight * (found - load)
     peak += alone * (height - peak)

@@ -177,6 +177,22 @@ def test_a_spike_of_one_frame_is_no_contact() -> None:
     assert [len(contacts.update(value, value > 0, time_ns)) for time_ns in (200_000_000, 220_000_000)] == [0, 1]
 
 
+def listed_ms(load: float) -> list[int]:
+    """When a contact with an uncertainty of 2 is listed, of half a second with gaps of a frame, ms."""
+    contacts, found = Contacts(2, neighbours_of_pairs([[0, 1]], 2)), []
+    for time_ms in range(0, 500, 20):
+        value = np.full(2, load * (time_ms % 60 > 0))
+        if len(contacts.update(value, value > 0, time_ms * 1_000_000, uncertainty=np.full(2, 2.0))):
+            found.append(time_ms)
+    return found
+
+
+def test_values_within_their_uncertainty_are_a_contact_only_if_they_last() -> None:
+    """What flickers as a touch ends is none; a faint load that is held is one."""
+    assert min(listed_ms(8.0)) == 40
+    assert min(listed_ms(7.9)) == 320
+
+
 @pytest.mark.parametrize(("peak", "most"), [(20.0, np.inf), (60.0, np.inf), (60.0, 40.0), (60.0, 25.0)])
 def test_what_threshold_and_clipping_cut_off_is_estimated(peak: float, most: float) -> None:
     squares = ((FLAT - FLAT[30 * 60 + 30] - [0.001, 0.002, 0]) ** 2).sum(axis=1)

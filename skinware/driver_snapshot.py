@@ -124,9 +124,11 @@ class DriverSnapshot(Sample):
 
     @property
     def data_path(self) -> DataPath:
-        """Which way the driver's frames take; ``MIXED`` where it is another for some buses, see ``bus_data_path``."""
-        own, of_buses = DataPath(int(self._optional("data_path", (1,), np.uint8)[0])), set(self.bus_data_path.tolist())
-        return DataPath.MIXED if of_buses >= {DataPath.PYTHON, DataPath.NATIVE} else own
+        """What receives the driver's frames; ``MIXED`` where buses differ, see ``bus_data_path``."""
+        of_buses = set(self.bus_data_path.tolist()) - {int(DataPath.NOT_TOLD)}
+        if not of_buses:
+            return DataPath(int(self._optional("data_path", (1,), np.uint8)[0]))
+        return DataPath(of_buses.pop()) if len(of_buses) == 1 else DataPath.MIXED
 
     @property
     def bus_data_path(self) -> npt.NDArray[np.uint8]:

@@ -162,7 +162,7 @@ def test_how_regular_patches_are_is_shown_where_it_is_told(capsys: pytest.Captur
     ("own", "of_buses", "path", "line"),
     [
         (DataPath.NATIVE, [DataPath.NATIVE, DataPath.NATIVE], "native", ""),
-        (DataPath.PYTHON, [DataPath.PYTHON, DataPath.PYTHON], "python", "Python receives the frames of can0, can1"),
+        (DataPath.NATIVE, [DataPath.PYTHON, DataPath.PYTHON], "python", "Python receives the frames of can0, can1"),
         (
             DataPath.NATIVE,
             [DataPath.NATIVE, DataPath.PYTHON],

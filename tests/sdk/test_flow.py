@@ -243,7 +243,7 @@ def test_in_another_loop_the_driver_takes_frames_without_the_flow(cable: Cable) 
         return DataPath(frame.data_path)
 
     with carried_on(EndOfCable(cable.out), hardware):
-        assert asyncio.run(run()) == DataPath.NATIVE
+        assert asyncio.run(run()) == DataPath.PYTHON
 
 
 def test_a_selector_without_a_flow_is_one_like_any_other() -> None:

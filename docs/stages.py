@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
+import multiprocessing
 import os
 import re
 import shutil
@@ -21,7 +23,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 import skinware
 import skinware.recording
-from skinware import DriverWriter, Namespace, ServiceWriter, SkinLayout, Structure
+from skinware import DriverWriter, Namespace, ServiceReader, ServiceWriter, SkinLayout, Structure
+from skinware.errors import RequestRefused
 from skinware.geometry import Geometry
 from skinware.memory import namespace
 from skinware.realtime import Periodic
@@ -31,6 +34,8 @@ from skinware.recording.replaying import Replayer
 from skinware.sensor_types import PRESSURE, SensorType
 from skinware.tactile.contacts import Contacts
 from skinware.tactile.contacts_service import ContactsWriter
+from skinware.tactile.health import HealthKind, HealthReport
+from skinware.tactile.health_service import HealthWriter
 from skinware.tactile.motion import MotionWriter
 from skinware.tactile.regions import Region, Regions
 from skinware.tactile.testing import Surface
@@ -106,6 +111,44 @@ def stop(process: subprocess.Popen[bytes]) -> None:
     process.send_signal(signal.SIGINT)
     if status := process.wait(PATIENCE_S):
         raise RuntimeError(f"skin-driver ended with {status}")
+
+
+_programs: list[multiprocessing.context.ForkProcess] = []
+
+
+def start_program(program: Callable[[], None]) -> None:
+    """Run a function of a page in a process of its own."""
+
+    def run() -> None:
+        with contextlib.suppress(KeyboardInterrupt):
+            program()
+
+    process = multiprocessing.get_context("fork").Process(target=run, daemon=True)
+    process.start()
+    _programs.append(process)
+
+
+def wait_for_requests(name: str) -> None:
+    """Wait until a service takes requests, which its loop does."""
+    deadline = time.monotonic() + PATIENCE_S
+    with ServiceReader(name, timeout_s=PATIENCE_S, announce=False) as reader:
+        while True:
+            try:
+                reader.request()
+            except RequestRefused:
+                assert time.monotonic() < deadline
+            else:
+                return
+
+
+def end_programs() -> None:
+    """Interrupt all programs, which then end in good order."""
+    for process in _programs:
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGINT)
+    for process in _programs:
+        process.join()
+        assert process.exitcode == 0
 
 
 def structure_of(surface: Surface, places: Geometry) -> Structure:
@@ -209,6 +252,16 @@ def press_an_arm() -> Structure:
     value[[9, 10, 17, 18]] = 1000, 1000, 2000, 2000
     _repeat(lambda _: writer.publish(value, value > 0, time.monotonic_ns()), writer)
     return structure
+
+
+def publish_a_stuck_taxel(position: int) -> HealthWriter:
+    """Publish the health of four taxels of the driver ``torso`` in the namespace ``calm``; one of them is stuck."""
+    structure = _assembled([Patch("p", [Module(taxels(4))])], PRESSURE.measured(), "<f4")
+    known = HealthReport.unknown(4)
+    known.kind[position] = HealthKind.STUCK
+    writer = HealthWriter(structure, "torso", namespace="calm")
+    writer.publish({"pressure": known}, 1)
+    return writer
 
 
 def stroke_an_arm() -> tuple[Structure, Regions, Contacts]:

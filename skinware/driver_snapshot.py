@@ -124,7 +124,7 @@ class DriverSnapshot(Sample):
 
     @property
     def data_path(self) -> DataPath:
-        """What receives the driver's frames; ``MIXED`` where buses differ, see ``bus_data_path``."""
+        """The code that receives the driver's frames; ``MIXED`` where buses differ, see ``bus_data_path``."""
         of_buses = set(self.bus_data_path.tolist()) - {int(DataPath.NOT_TOLD)}
         if not of_buses:
             return DataPath(int(self._optional("data_path", (1,), np.uint8)[0]))

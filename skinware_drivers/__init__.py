@@ -1,4 +1,4 @@
-"""The driver SDK: what somebody needs who writes a driver; see also ``.can``, ``.serial`` and ``.virtual``."""
+"""The names that an author of drivers needs; more are in ``.can``, ``.serial``, ``.modbus`` and ``.virtual``."""
 
 from __future__ import annotations
 

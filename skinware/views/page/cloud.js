@@ -1,4 +1,5 @@
-// The taxels of one type of a driver in WebGL: one draw call of points, each drawn as a disc that lies in the skin.
+// The taxels of one type of a driver in WebGL: points, each drawn as a disc that lies in the skin. Those with a sign are
+// drawn apart: a program without branches is much faster where no graphics card runs it.
 
 import {
   BufferAttribute,
@@ -9,6 +10,7 @@ import {
   Points,
   RawShaderMaterial,
 } from "./vendor/three.min.js";
+import { DIMMED } from "./marks.js";
 
 const VERTEX = `
 precision highp float;
@@ -44,6 +46,7 @@ void main() {
   slope.z = size;
   colour = texelFetch(ramp, ivec2(int(level), 0), 0).rgb;
   kind = mark & 0x7fu;
+  if ((kind != 0u) != HAS_SIGN) gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // not of this program: outside the picture
   if (kind == 1u) colour = mix(colour, ground, 0.6);
   veil = (mark & 0x80u) != 0u ? 0.78 : facing < 0.0 ? 0.7 : 0.0;  // not selected; seen from inside
 }`;
@@ -65,7 +68,7 @@ void main() {
   float edge = (1.0 - r) * slope.z + 0.5;                 // pixels from the rim inwards
   if (edge <= 0.0) discard;
   vec3 c = colour;
-  if (kind != 0u) {
+  if (HAS_SIGN) {
     float pen = clamp(1.3 / slope.z, 0.14, 0.4);
     bool rim = r > 1.0 - pen;
     vec3 soft = mix(ground, ink, 0.45);
@@ -84,25 +87,27 @@ void main() {
   shown = vec4(mix(c, ground, veil), min(edge, 1.0));
 }`;
 
-/** The material of all clouds; the stage sets its uniforms. */
+/** The materials of all clouds, without signs and with them; the stage sets their uniforms, which are the same. */
 export function discs(rampTexture) {
-  return new RawShaderMaterial({
+  const uniforms = {
+    ramp: { value: rampTexture },
+    pixels: { value: 1 },
+    ground: { value: [0, 0, 0] },
+    ink: { value: [1, 1, 1] },
+  };
+  const common = {
     glslVersion: GLSL3,
     transparent: true, // at their rims
     vertexShader: VERTEX,
     fragmentShader: FRAGMENT,
-    uniforms: {
-      ramp: { value: rampTexture },
-      pixels: { value: 1 },
-      ground: { value: [0, 0, 0] },
-      ink: { value: [1, 1, 1] },
-    },
-  });
+    uniforms,
+  };
+  return ["false", "true"].map((HAS_SIGN) => new RawShaderMaterial({ ...common, defines: { HAS_SIGN } }));
 }
 
 /** Points of a sheet; `update` uploads what has changed of its levels and marks. */
 export class Cloud {
-  constructor(sheet, material) {
+  constructor(sheet, materials) {
     this.sheet = sheet;
     this.geometry = new BufferGeometry();
     this.geometry.setAttribute("position", new BufferAttribute(sheet.position, 3));
@@ -112,8 +117,8 @@ export class Cloud {
     this.marks = bytes(sheet.n);
     this.geometry.setAttribute("level", this.levels);
     this.geometry.setAttribute("mark", this.marks);
-    this.points = new Points(this.geometry, material);
-    this.points.frustumCulled = false;
+    this.points = materials.map((material) => new Points(this.geometry, material));
+    for (const points of this.points) points.frustumCulled = false;
     this.update();
   }
 
@@ -125,6 +130,7 @@ export class Cloud {
       this.marksSeen = this.sheet.marksVersion;
       this.marks.array.set(marks);
       this.marks.needsUpdate = true;
+      this.points[1].visible = marks.some((mark) => mark & ~DIMMED);
     }
   }
 

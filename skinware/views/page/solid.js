@@ -32,7 +32,8 @@ export class Solid {
     this.light = new DirectionalLight(0xffffff, 1.2);
     this.scene.add(this.light);
     this.ramp = new DataTexture(ramp(theme), 256, 1);
-    this.material = discs(this.ramp);
+    this.discs = discs(this.ramp);
+    this.uniforms = this.discs[0].uniforms;
     this.linkMaterial = new MeshLambertMaterial({ flatShading: true });
     this.bodyMaterial = new MeshLambertMaterial({ color: 0 }); // in one colour, whatever the light
     this.body = new Mesh(new BufferGeometry(), this.bodyMaterial);
@@ -44,8 +45,8 @@ export class Solid {
     this.ramp.image.data.set(ramp(theme));
     this.ramp.needsUpdate = true;
     const unit = (rgb) => rgb.map((x) => x / 255);
-    this.material.uniforms.ground.value = unit(GROUND[theme]);
-    this.material.uniforms.ink.value = unit(INK[theme]);
+    this.uniforms.ground.value = unit(GROUND[theme]);
+    this.uniforms.ink.value = unit(INK[theme]);
     this.renderer.setClearColor(cssColour(GROUND[theme]));
     this.bodyMaterial.emissive = cssColour(BODY[theme]);
     this.linkMaterial.color = cssColour(GROUND[theme].map((x, c) => x + 0.22 * (INK[theme][c] - x)));
@@ -53,11 +54,11 @@ export class Solid {
 
   setSheets(sheets) {
     for (const cloud of this.#clouds) {
-      this.scene.remove(cloud.points);
+      this.scene.remove(...cloud.points);
       cloud.dispose();
     }
-    this.#clouds = sheets.map((sheet) => new Cloud(sheet, this.material));
-    for (const cloud of this.#clouds) this.scene.add(cloud.points);
+    this.#clouds = sheets.map((sheet) => new Cloud(sheet, this.discs));
+    for (const cloud of this.#clouds) this.scene.add(...cloud.points);
     this.body.geometry.dispose();
     this.body.geometry = new BufferGeometry();
     this.body.geometry.setAttribute("position", new BufferAttribute(trianglesOf(outlinesOf(sheets)), 3));
@@ -86,7 +87,7 @@ export class Solid {
 
   render(camera) {
     const halfAngle = (camera.fov * Math.PI) / 360;
-    this.material.uniforms.pixels.value = this.canvas.height / (2 * Math.tan(halfAngle));
+    this.uniforms.pixels.value = this.canvas.height / (2 * Math.tan(halfAngle));
     this.light.position.copy(camera.position);
     this.renderer.render(this.scene, camera);
   }

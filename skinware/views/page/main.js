@@ -34,7 +34,7 @@ import { progressOf, Wipe } from "./wipe.js";
 
 const MODES = { raw: "Values", change: "Change", peak: "Peaks", wipe: "Wipe test" };
 const [TURN, NEARER, SCROLL_S] = [0.12, 0.85, 0.2]; // of a key: rad, of the distance, s
-const FIGURES_EVERY_MS = 90; // figures that change more often cannot be read
+const FIGURES_EVERY_MS = 250; // figures that change more often cannot be read
 
 const wanted = address.fromHash(location.hash);
 const query = new URLSearchParams(location.search);
@@ -175,6 +175,7 @@ function turn(message) {
     if (header.pictures) names.hold();
   }
   if (performance.now() - now.figures_ms > FIGURES_EVERY_MS) showFigures();
+  else plotting.strips.follow();
   afterFrame(() => link.next());
 }
 

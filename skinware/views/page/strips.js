@@ -9,6 +9,7 @@ import { colourOf, dashOf, drawFigure, drawSpectrum, drawTimes, figureHeight, MO
 const MOST = 16; // lines in all
 const LEAST_S = 0.05;
 const ZOOM = 1.25;
+const EVERY_MS = 90; // that a line moves by a pixel or two
 const STEPS = 100; // of the cursor, from one end to the other
 const FIGURE = { width: 720, height: 260 };
 const NOTHING = { times: new Float64Array(0), values: new Float64Array(0) };
@@ -118,9 +119,10 @@ class Strip {
     else drawTimes(pen, what);
   }
 
-  draw() {
+  /** Draw the lines. @returns {?object} what was drawn; null while there is no room. */
+  paint() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    if (!width || !height) return;
+    if (!width || !height) return null;
     const ratio = Math.min(devicePixelRatio, 2);
     const [wide, tall] = [Math.round(width * ratio), Math.round(height * ratio)];
     if (this.canvas.width !== wide) this.canvas.width = wide;
@@ -129,6 +131,13 @@ class Strip {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     const what = this.#what({ width, height }, this.strips.theme);
     this.#paint(new CanvasPen(context), what);
+    return what;
+  }
+
+  /** Draw the lines, and what is written beside them. */
+  draw() {
+    const what = this.paint();
+    if (!what) return;
     setPressed(this.spectrum, this.isSpectrum);
     this.#label(what);
   }
@@ -216,6 +225,7 @@ export class Strips {
   #frozen = null; // copies of the values, while time stands still
   #span_s = KEPT_S;
   #end_ns = null; // of the window; null: now
+  #drawn_ms = 0;
 
   /**
    * @param {HTMLElement} host
@@ -360,8 +370,16 @@ export class Strips {
     return Math.min(this.frozen_ns, Math.max(this.frozen_ns - 1e9 * (KEPT_S - this.#span_s), end_ns));
   }
 
+  /** Draw what is new in the lines, as often as their movement needs. */
+  follow() {
+    if (performance.now() - this.#drawn_ms < EVERY_MS) return;
+    this.#drawn_ms = performance.now();
+    for (const strip of this.#strips) strip.paint();
+  }
+
   draw() {
     if (!this.#strips.length) return;
+    this.#drawn_ms = performance.now();
     const missed = this.lines.missed ? `, ${this.lines.missed} samples missed` : "";
     setText(this.span, `${figure(this.#span_s)} s${missed}`);
     for (const strip of this.#strips) strip.draw();

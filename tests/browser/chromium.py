@@ -23,7 +23,7 @@ PACKAGE = "chromium"
 """Debian's; it brings SwiftShader, and through fontconfig a font."""
 FLAGS = (
     "--no-sandbox",  # which root cannot have, and a container has not
-    "--use-angle=swiftshader",
+    "--disable-gpu",  # as where there is no graphics card: its own picture without GL, that of WebGL by SwiftShader
     "--enable-unsafe-swiftshader",
     "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1 , EXCLUDE localhost",
     "--disable-background-networking",

@@ -174,8 +174,8 @@ def test_recordings_are_controlled_together_or_alone(page: Page, server: FakeSer
     assert "0:03.0 of 1:00.0" in panel.inner_text()
     for name in ("Pause", "Back", "Step", "Loop"):
         panel.get_by_role("button", name=name).click()
-    assert panel.locator("select").input_value() == "1.5"
-    panel.locator("select").select_option("4")
+    assert panel.get_by_label("Speed").input_value() == "1.5"
+    panel.get_by_label("Speed").select_option("4")
     first, second = panel.get_by_role("slider").all()
     width = int((first.bounding_box() or {"width": 0})["width"])
     first.hover(position={"x": width // 2 + 3, "y": 15})

@@ -113,7 +113,7 @@ def test_it_is_saved_for_papers(sleeve: Sleeve, address: str, open_page: OpenPag
     assert float(rows[-1][2]) == 160 * 15
     svg = files["SVG"].read_text()
     assert svg.startswith("<svg ")
-    for text in (f"{name}, counts", "board 8, sum, counts", "sleeve (fake), 20", "UTC", "0 s"):
+    for text in (f">{name}<", ">board 8, sum<", ">counts<", "sleeve (fake), 20", "UTC", "0 s"):
         assert text in svg
     assert files["PNG"].read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     with page.expect_download() as download:

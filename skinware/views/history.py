@@ -26,6 +26,7 @@ LENGTH_S = 10.0
 _FRAMES = 320
 """Snapshots that are kept at most: ten seconds at 32 a second."""
 _TIMES_THE_NOISE = 6
+_FOLLOW_EVERY_NS = NS_PER_S // 10
 
 
 def rounded_up(value: float) -> float:
@@ -60,15 +61,18 @@ class DriverRest:
         self._age_s = np.zeros(n, np.float32)
         self._unrest = np.zeros(n, np.float32)
         self._time_ns: int | None = None
+        self._every_ns = 0
 
     def follow(self, physical: Floats, fresh: npt.NDArray[np.bool_], time_ns: int) -> None:
-        """Take a snapshot into account; the same one again changes nothing.
+        """Take a snapshot into account; the same one again changes nothing. At rest, ten a second are enough.
 
         Args:
             physical: (n,) physical values.
             fresh: (n,) bool; other sensors are left out.
             time_ns: when it was published, CLOCK_MONOTONIC.
         """
+        if self._time_ns is not None and 0 <= time_ns - self._time_ns < self._every_ns:
+            return
         passed_s = np.float32(0 if self._time_ns is None else min(1.0, max(0, time_ns - self._time_ns) / 1e9))
         self._time_ns = time_ns
         counts = fresh & np.isfinite(physical)
@@ -80,6 +84,7 @@ class DriverRest:
         self._age_s += passed_s * counts
         follow_s = np.where(settling, self._age_s, slow_s)
         self.baseline += change * (passed_s / np.maximum(follow_s + passed_s, np.float32(1e-9)))
+        self._every_ns = 0 if (settling & counts).any() else _FOLLOW_EVERY_NS
 
     def change(self, physical: Floats) -> Floats:
         """Return (n,) float32, 0 or more: distance of values from the baseline, up or down; 0 without a baseline."""

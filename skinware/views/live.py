@@ -199,13 +199,21 @@ class LiveBridges(Drivers[BridgeReader]):
 class LiveSources(Drivers[SourceReader[SampleT]], Generic[SampleT]):
     """The services of one kind in a namespace, each of which is about one driver."""
 
+    def __init__(self, namespace: Namespace, reader: Callable[..., SourceReader[SampleT]]) -> None:
+        super().__init__(namespace, reader)
+        self._known: dict[str, SampleT] = {}
+
     def of(self, driver: str) -> SampleT | None:
         """Return the newest sample of the service for a driver; None where no living service has one."""
-        for name, reader in self.readers.items():
-            if reader.source.driver == driver:
-                sample: SampleT | None = self.newest(name)
-                return None if sample is None or sample.stale else sample
-        return None
+        name = next((name for name, reader in self.readers.items() if reader.source.driver == driver), "")
+        newer: SampleT | None = self.newest(name, newer_than=self._known.get(name))
+        if newer is not None:
+            self._known[name] = newer
+        known, reader = self._known.get(name), self.readers.get(name)
+        if known is None or reader is None or not reader.alive:
+            return None
+        newest = reader.newest_position  # None, or of another generation: it has begun again
+        return known if newest is not None and newest[0] == known.generation else None
 
 
 class TouchedPlace(NamedTuple):
@@ -233,8 +241,8 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
         own = sensors[contact.taxels]
         nearest = 0
         if structure.geometry is not None:
-            away_m = np.linalg.norm(structure.geometry.position_m[own] - contact.cop_m, axis=1)
-            nearest = int(np.nan_to_num(away_m, nan=np.inf).argmin())
+            away_m2 = ((structure.geometry.position_m[own] - contact.cop_m) ** 2).sum(axis=1)
+            nearest = int(np.fmin(away_m2, np.inf).argmin())
         sensor = int(own[nearest])
         module = structure.module_names[structure.sensor_module[sensor]]
         found.append(TouchedPlace(contact, source.unit, sensor, module))

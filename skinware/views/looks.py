@@ -167,16 +167,16 @@ class Look:
         quantity, newest = self.quantity_of(driver), driver.newest
         if quantity is None or newest is None:
             return
-        memory, values, fresh = self._memory_of(driver), newest.all_physical(), newest.status == 0
+        memory = self._memory_of(driver)
         if memory.rest is not driver.rest:
-            memory.rest.follow(values, fresh, newest.frame.published_ns)
+            memory.rest.follow(newest.all_physical(), newest.status == 0, newest.frame.published_ns)
         if self.mode == "peak":
             change = newest.highest_change(quantity, memory.rest.baseline)
             memory.peak = quantity.name, np.fmax(_peaks(memory, quantity), change).astype(np.float32)
         if self.mode == "wipe" and self._wiping:
             if memory.wipe is None:
                 memory.wipe = WipeTest(driver.structure)
-            memory.wipe.follow(values, fresh)
+            memory.wipe.follow(newest.all_physical(), newest.status == 0)
         totals = None if self.mode == "wipe" else newest.totals(quantity, self._rest(memory))
         memory.loads.extend((quantity.name, row) for row in (() if totals is None else totals))
 

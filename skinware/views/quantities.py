@@ -289,9 +289,8 @@ class Newest:
     @property
     def marked(self) -> npt.NDArray[np.uint8]:
         """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
-        return self.once(
-            "marked", lambda: np.where(self.settling & ((self.status & _NEVER_SEEN) != 0), _ALL_BITS, self.status)
-        )
+        unseen = (self.status & _NEVER_SEEN) != 0
+        return np.where(self.settling & unseen, _ALL_BITS, self.status) if unseen.any() else self.status
 
     @property
     def all(self) -> Sequence[DriverSnapshot]:

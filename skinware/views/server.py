@@ -117,20 +117,24 @@ class ViewServer:
     async def _follow(self) -> None:
         """Follow the drivers while there are viewers, without end."""
         while True:
-            if self._viewers:
-                for show in {viewer.show for viewer in self._viewers}:
-                    viewers = [viewer for viewer in self._viewers if viewer.show is show]
-                    period_ns = round(NS_PER_S / max(viewer.look.fps for viewer in viewers))
-                    for driver in show.follower.take(period_ns):
-                        for viewer in viewers:
-                            viewer.look.follow(driver)
-                    show.follow()
-                for viewer in self._viewers:
-                    viewer.plots.take()
+            pauses_s = [self._take(show) for show in {viewer.show for viewer in self._viewers}]
+            if pauses_s:
                 problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
                 self._doctor.follow([problem for problem in problems if NOTE not in problem])
                 self._wake()
-            await asyncio.sleep(_TICK_S)
+            await asyncio.sleep(min(pauses_s, default=_TICK_S))
+
+    def _take(self, show: Show) -> float:
+        """Take what is new of a show for its viewers, and return the time until it is worth looking again, s."""
+        viewers = [viewer for viewer in self._viewers if viewer.show is show]
+        period_s = 1 / max(viewer.look.fps for viewer in viewers)
+        newer = show.follower.take(round(period_s * NS_PER_S))
+        for viewer in viewers:
+            for driver in newer:
+                viewer.look.follow(driver)
+            viewer.plots.take()
+        show.follow()
+        return max(period_s, _TICK_S) if newer else _TICK_S
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         try:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.tactile.contacts_service import ContactsSample
 from skinware.text import why_text
 from skinware.views import looks
 from skinware.views.following import ShownDriver
@@ -61,6 +62,7 @@ class Viewer:
         self._edition = -1
         self._changes: dict[int, tuple[int, int]] = {}
         self._status: dict[tuple[int, str], npt.NDArray[np.uint8]] = {}
+        self._touches: dict[int, tuple[tuple[object, ...], list[dict[str, Any]]]] = {}
         self._state_due_ns = 0
         self._lives: list[str] = []
         self._exact: list[tuple[int, int]] = []
@@ -229,7 +231,14 @@ class Viewer:
         return shown
 
     def _contacts(self, driver: ShownDriver, quantity: Quantity, newest: Newest) -> list[dict[str, Any]]:
-        frame = newest.contacts
+        seen = newest.contacts_position, quantity.name, self._edition
+        if self._touches.get(driver.number, (None, []))[0] != seen:
+            self._touches[driver.number] = seen, self._contacts_in(driver, quantity, newest.contacts)
+        return self._touches[driver.number][1]
+
+    def _contacts_in(
+        self, driver: ShownDriver, quantity: Quantity, frame: ContactsSample | None
+    ) -> list[dict[str, Any]]:
         if frame is None or frame.source.type_name != quantity.type.name:
             return []
         laid_out = self._follower.scene.of(driver.name, quantity.name).position

@@ -1,14 +1,14 @@
-"""Learn to grip objects of unknown size and stiffness, with and without touch.
+"""Learn to grip cups of unknown width and stiffness, with and without touch.
 
-A finger closes on an object until it holds it with 4 N. An expert that knows the force shows how; its touch is recorded
-as that of any driver, and becomes a LeRobot dataset. A small policy learns from the dataset, and then moves the finger
-itself, reading the skin live::
+A simulated gripper closes on a cup until each finger holds it with 4 N. An expert that knows the force shows how; its
+touch is recorded as that of any driver, and becomes a LeRobot dataset. A small policy learns from the dataset, and then
+moves the gripper itself::
 
     python grip.py make grips                # 60 grips in 75 s: grips/grips.mcap, and the dataset grips/set
     python grip.py train grips               # 5 seeds with and without touch; needs lerobot and torch
     python grip.py plot grips                # grips/curves.png; needs matplotlib
 
-The finger and its pad of 4 x 4 taxels are simulated here; all else is as with a real hand.
+`Grip` is an environment of Gymnasium, for any program that learns; all else is as with a real hand.
 """
 
 from __future__ import annotations
@@ -18,82 +18,89 @@ import json
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
-import numpy.typing as npt
 
 from skinware import DriverWriter, Structure
-from skinware.learning import LiveTouch, Totals
 from skinware.realtime import Periodic
 from skinware.sensor_types import PRESSURE
+from skinware_drivers.learning import SkinEnv
 
 RATE_HZ, STEPS, GRIPS = 50, 60, 60
 WANTED_N, TOLERANCE_N = 4.0, 0.8
-FASTEST = 0.05
-"""Largest step of the finger, of its way from open (0) to closed (1)."""
+FASTEST_M = 0.0015
+"""Largest step of the fingers' target."""
+DOWN_M = -0.065
 SEEDS, HIDDEN, BATCH = 5, 64, 256
 CHECKPOINTS = (50, 100, 200, 400, 800)
 """Steps of training after which the policy grips."""
 TRIALS = 20
 
-PAD = Structure(
-    types=[PRESSURE.measured(unit="counts", minimum=0.0, maximum=255.0)],
+PADS = Structure(
+    types=[PRESSURE.measured(unit="counts", minimum=0.0, maximum=65535.0)],
     buses=["simulated"],
-    patch_name=["finger"],
-    patch_bus=[0],
-    module_patch=[0],
-    module_kind=["4x4"],
-    sensor_uid=np.arange(16),
-    sensor_type=[PRESSURE.id] * 16,
-    sensor_module=[0] * 16,
+    patch_name=["left", "right"],
+    patch_bus=[0, 0],
+    module_patch=[0, 1],
+    module_kind=["7x4", "7x4"],
+    sensor_uid=np.arange(56),
+    sensor_type=[PRESSURE.id] * 56,
+    sensor_module=np.repeat([0, 1], 28),
     dtype="<f4",
 )
 
 
-@dataclass
-class Grip:
-    """One object between finger and thumb.
+class Grip(SkinEnv):
+    """A gripper around a cup. An action, (1,) in -1 to 1, is a step of its fingers: 1 closes them as fast as it can."""
 
-    Attributes:
-        width: closing at which the finger meets it, 0 to 1.
-        stiffness: N for the whole way beyond that.
-        spot: (2,) where on the pad it presses, in taxels.
-    """
+    def __init__(self, **more: Any) -> None:
+        super().__init__("mujoco:gripper", "robotiq_tsf", actuators=["close"], rate_hz=RATE_HZ, steps=STEPS, **more)
+        self.closed_m, self.open_m = self.action_space.high[0], 0.0
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
 
-    width: float
-    stiffness: float
-    spot: npt.NDArray[np.float64]
-    closing: float = 0.0
+    def begin(self, options: Mapping[str, Any]) -> None:
+        self.target_m = self.open_m
+        self.scene.data.joint("lift").qpos[:] = DOWN_M
+        self.scene.actuators.move({"lift": DOWN_M})
+        self.scene.model.geom("cup").size[0] = self.np_random.uniform(0.018, 0.028)
+        stiffness = self.np_random.uniform(300, 4000)
+        for pad in ("left_pad", "right_pad"):
+            self.scene.model.geom(pad).solref[0] = -stiffness
 
-    @classmethod
-    def random(cls, generator: np.random.Generator) -> Grip:
-        return cls(generator.uniform(0.25, 0.75), generator.uniform(20, 60), generator.uniform(1, 2, 2))
+    def step(self, action: Any) -> Any:
+        step_m = float(np.clip(action[0], -1, 1)) * FASTEST_M
+        self.target_m = float(np.clip(self.target_m + step_m, self.open_m, self.closed_m))
+        return super().step(np.array([self.target_m]))
 
-    @property
-    def force_n(self) -> float:
-        return max(0.0, self.closing - self.width) * self.stiffness
-
-    def move(self, step: float) -> None:
-        self.closing = float(np.clip(self.closing + np.clip(step, -1, 1) * FASTEST, 0, 1))
-
-    def publish(self, writer: DriverWriter, generator: np.random.Generator) -> int:
-        """Publish what the pad feels, with noise, and return when."""
-        row, column = np.divmod(np.arange(16), 4)
-        near = np.exp(-((row - self.spot[0]) ** 2 + (column - self.spot[1]) ** 2) / 1.5)
-        columns, time_ns = writer.begin(), time.monotonic_ns()
-        columns["values"][:] = np.clip(8 * self.force_n * near + generator.normal(2, 1, 16), 0, 255)
-        columns["status"][:] = 0
-        columns["module_time_ns"][:] = time_ns
-        writer.commit(time_ns)
-        return time_ns
+    def judge(self, action: Any) -> tuple[float, bool]:
+        force_n = sum(touch.normal_n for touch in self.scene.touching()) / 2
+        return -abs(force_n - WANTED_N) / WANTED_N, False
 
 
-def expert(force_n: float) -> float:
+def expert(info: Mapping[str, Any]) -> float:
     """Return the step of one who feels the force: fast until it touches, then ever more slowly."""
-    return float(np.clip((WANTED_N - force_n) / WANTED_N, -1, 1))
+    return float(np.clip((WANTED_N - info["force_n"].mean()) / WANTED_N, -1, 1))
+
+
+def publish(writer: DriverWriter, observation: Mapping[str, Any]) -> int:
+    """Publish what the pads feel, and return when."""
+    columns, time_ns = writer.begin(), time.monotonic_ns()
+    columns["values"][:] = observation["touch"]
+    columns["status"][:] = 0
+    columns["module_time_ns"][:] = time_ns
+    writer.commit(time_ns)
+    return time_ns
+
+
+def state_of(observation: Mapping[str, Any], has_touch: bool) -> list[float]:
+    """Return the closing of the fingers, m, and with touch also the sum and the largest value of each pad."""
+    pads = observation["touch"].reshape(2, -1)
+    touch = np.column_stack([pads.sum(axis=1), pads.max(axis=1)]).ravel()
+    return [float(observation["position"][0]), *(touch.tolist() if has_touch else [])]
 
 
 def make(folder: Path) -> None:
@@ -103,25 +110,26 @@ def make(folder: Path) -> None:
     from skinware.recording.recorder import Recorder
 
     folder.mkdir()
-    generator = np.random.default_rng(0)
+    generator, env = np.random.default_rng(0), Grip()
     recorder = Recorder(Files(folder / "grips.mcap"))
     thread = threading.Thread(target=recorder.run)
     thread.start()
-    with DriverWriter("finger", PAD, rate_hz=RATE_HZ) as writer, (folder / "joints.csv").open("w") as file:
+    with DriverWriter("fingers", PADS, rate_hz=RATE_HZ) as writer, (folder / "joints.csv").open("w") as file:
         rows = csv.writer(file)
         rows.writerow(("monotonic_ns", "closing", "step"))
         for number in range(GRIPS):
-            grip = Grip.random(generator)
+            observation, info = env.reset(seed=number)
             for turn, _ in enumerate(Periodic(RATE_HZ)):
-                time_ns = grip.publish(writer, generator)
+                time_ns = publish(writer, observation)
                 if turn == 0:
                     recorder.mark(f"grip {number}", time_ns)
                 if turn == STEPS:
                     recorder.mark("end", time_ns)
                     break
-                step = expert(grip.force_n) + generator.normal(0, 0.1)  # so that it sees how to mend an error
-                rows.writerow((time_ns, f"{grip.closing:.5f}", f"{expert(grip.force_n):.5f}"))
-                grip.move(step)
+                rows.writerow((time_ns, f"{observation['position'][0]:.6f}", f"{expert(info):.5f}"))
+                step = expert(info) + generator.normal(0, 0.1)  # so that it sees how to mend an error
+                observation, *_, info = env.step([step])
+    env.close()
     recorder.stop()
     thread.join()
     joins = [
@@ -147,10 +155,8 @@ def train(folder: Path) -> None:
     )
     actions = actions.reshape(len(actions), 1)
     curves: dict[str, list[list[float]]] = {}
-    for name, columns in (
-        ("without", ["closing"]),
-        ("with touch", ["closing", "touch.finger.sum.vel", "touch.finger.peak.vel"]),
-    ):
+    touch = [f"touch.{pad}.{number}.vel" for pad in ("left", "right") for number in ("sum", "peak")]
+    for name, columns in (("without", ["closing"]), ("with touch", ["closing", *touch])):
         inputs = states[:, [names.index(column) for column in columns]]
         curves[name] = [_curve(torch, inputs, actions, seed) for seed in range(SEEDS)]
         last = [curve[-1] for curve in curves[name]]
@@ -184,20 +190,15 @@ def _curve(torch: Any, inputs: Any, actions: Any, seed: int) -> list[float]:
 
 
 def _held(torch: Any, policy: Any, has_touch: bool, seed: int) -> float:
-    """Return the share of new objects that a policy holds at the end with about the wanted force."""
-    generator = np.random.default_rng(1000 + seed)
-    held = 0
-    with DriverWriter("finger", PAD, rate_hz=RATE_HZ) as writer:
-        Grip.random(generator).publish(writer, generator)
-        with LiveTouch(drivers=["finger"]) as live, torch.no_grad():
-            totals = Totals(live.layout, "pressure", live.positions)
-            for _ in range(TRIALS):
-                grip = Grip.random(generator)
-                for _ in range(STEPS):
-                    touch = live.at(grip.publish(writer, generator))
-                    state = [grip.closing, *(totals.of(touch.values).tolist() if has_touch else [])]
-                    grip.move(float(policy(torch.tensor([state]))))
-                held += abs(grip.force_n - WANTED_N) <= TOLERANCE_N
+    """Return the share of new cups that a policy holds in the end with about the wanted force."""
+    env, held = Grip(), 0
+    with torch.no_grad():
+        for trial in range(TRIALS):
+            observation, info = env.reset(seed=1000 * (seed + 1) + trial)
+            for _ in range(STEPS):
+                observation, *_, info = env.step(policy(torch.tensor([state_of(observation, has_touch)]))[0].numpy())
+            held += abs(info["force_n"].mean() - WANTED_N) <= TOLERANCE_N
+    env.close()
     return held / TRIALS
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import os
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,7 @@ from skinware.errors import BusNotAvailable, ConfigurationError, PlatformError
 from skinware_drivers.learning import SkinEnv
 from skinware_drivers.virtual.physics.binding import find_binding
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "learning" / "grip.py"
 DOWN, RATE_HZ = -0.065, 50.0
 
 
@@ -114,6 +117,21 @@ def test_an_episode_ends() -> None:
         done = [env.step(np.array([DOWN, 0.03], np.float32))[2] for _ in range(20)]
         assert not done[0]
         assert done[-1], "more than 12 N"
+
+
+def test_the_expert_of_the_example_holds_any_cup() -> None:
+    grip = runpy.run_path(str(EXAMPLE))
+    with closing(grip["Grip"]()) as env:
+        for seed in range(4):
+            observation, info = env.reset(seed=seed)
+            truncated = False
+            while not truncated:
+                observation, reward, _, truncated, info = env.step([grip["expert"](info)])
+            assert info["force_n"].mean() == pytest.approx(grip["WANTED_N"], abs=0.1)
+            assert reward == pytest.approx(0, abs=0.03)
+            closing_m, *touch = grip["state_of"](observation, True)
+            assert closing_m == pytest.approx(observation["position"][0])
+            assert touch == [number for pad in np.split(observation["touch"], 2) for number in (pad.sum(), pad.max())]
 
 
 RECOMMENDED = "ignore:.*(symmetric and normalized|observation space m...mum value):UserWarning"

@@ -132,6 +132,8 @@ class _CountedText(io.TextIOWrapper):
         while True:
             self.number += 1
             line = super().__next__()
+            if not line.endswith("\n"):  # half its data would be a frame, too
+                raise ValueError("cut off: it has no line feed")
             if not _ERROR_FRAME.search(line):
                 return line
 

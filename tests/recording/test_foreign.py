@@ -192,6 +192,18 @@ def test_parquet(tmp_path: Path) -> None:
     require(only(folder), np.concatenate([values, matrix.reshape(N, 12)], axis=1))
 
 
+def test_a_parquet_page_that_does_not_fit_its_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "flipped.parquet"
+    table = pa.table({"time": TIMES, "taxel_0": counts(N)})
+    pa.parquet.write_table(table, path, use_dictionary=False, compression="none", write_page_checksum=True)
+    require(only(path), counts(N)[:, None])
+    data = path.read_bytes()
+    value = counts(N)[N - 1].tobytes()
+    path.write_bytes(data.replace(value, bytes([value[0] ^ 1]) + value[1:]))
+    with pytest.raises(ConfigurationError, match="damaged"):
+        imported(path)
+
+
 def write_dataset(folder: Path, lengths: list[int], version: str = "v3.0") -> npt.NDArray[np.float32]:
     values = np.random.default_rng(8).random((sum(lengths), 6)).astype(np.float32)
     (folder / "meta").mkdir(parents=True)

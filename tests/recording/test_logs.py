@@ -195,6 +195,16 @@ def test_a_log_that_is_damaged_later_ends_there(tmp_path: Path, caplog: pytest.L
     assert [record.message.partition(": damaged")[0] for record in caplog.records] == [f"{path}, line {before + 1}"]
 
 
+@pytest.mark.parametrize("before", ["(1.1) can0 123#1122", "date Mon\nbase hex\n 1.1 1  123  Rx   d 2 11 22"])
+def test_a_frame_that_is_cut_off_is_none(tmp_path: Path, caplog: pytest.LogCaptureFixture, before: str) -> None:
+    """Its data would be half of those that were on the bus."""
+    path, last = tmp_path / "cut", before.splitlines()[-1].replace("d 2", "d 1")
+    path.write_text(f"{before}\n{last[:-2].rstrip()}")
+    (wire,) = LogFile(str(path)).wires
+    assert [item.data.hex() for item in wire.items()] == ["1122"]
+    assert "cut off: it has no line feed" in caplog.text
+
+
 def test_a_log_at_full_speed_is_read_completely(tmp_path: Path) -> None:
     """50,000 frames of 1 s without a clock that goes, and with one that jumps between two reads."""
     n = 50_000

@@ -155,7 +155,7 @@ class ParquetSource(ColumnSource):
 
     def _opened(self, path: Path) -> Any:
         with blamed(lambda reason: f"{path}: not Parquet, or damaged ({reason})"):
-            return self._arrow.parquet.ParquetFile(path)
+            return self._arrow.parquet.ParquetFile(path, page_checksum_verification=True)
 
     def _array(self, path: Path, name: str, column: Any) -> npt.NDArray[Any]:
         shape = [len(column)]

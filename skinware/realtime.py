@@ -52,7 +52,7 @@ WAIT_SLICE_NS = 50_000_000
 
 
 def now_ns() -> int:
-    """CLOCK_MONOTONIC in ns: the time base of every frame."""
+    """CLOCK_MONOTONIC in ns: the time base of every sample."""
     return time.monotonic_ns()
 
 

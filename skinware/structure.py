@@ -137,7 +137,7 @@ class Structure:
         """Return the same patches and modules with some of their sensors.
 
         Args:
-            positions: in a frame, of the sensors that stay, in their order.
+            positions: in a sample, of the sensors that stay, in their order.
 
         Raises:
             StructureError: there are none.
@@ -178,7 +178,7 @@ class Structure:
 
     @cached_property
     def groups_are_modules(self) -> bool:
-        """Whether every module is one update group, so that frames need no times of groups beside those of modules."""
+        """Whether every module is one update group, so that samples need no times of groups beside those of modules."""
         return np.array_equal(self.group_module, np.arange(self.n_modules))
 
     @cached_property
@@ -272,7 +272,7 @@ class Structure:
         their type instead of ``taxel``.
 
         Args:
-            position: in a frame.
+            position: in a sample.
         """
         return _names.joined(self.module_names[self.sensor_module[position]], self.name_in_module(position))
 
@@ -338,7 +338,7 @@ class Structure:
         return self._index_by_patch[patch]
 
     def position(self, type_name: str, uid: int) -> int:
-        """Return position in a frame of one sensor.
+        """Return position in a sample of one sensor.
 
         Raises:
             StructureError: no such type, or no sensor of that uid with this type.
@@ -379,7 +379,7 @@ class Structure:
         """Physical values of all sensors of a type.
 
         Args:
-            values: (..., n_sensors) raw values of a whole frame, or of many.
+            values: (..., n_sensors) raw values of a whole sample, or of many.
             type_name: which sensors to take.
 
         Returns:

@@ -13,7 +13,7 @@ from skinware.status import Status, Why
 
 NO_VALUE = "-"
 NOT_FRESH = "not fresh"
-"""Shown instead of ``live`` where frames arrive, but no sensor in them is fresh."""
+"""Shown instead of ``live`` where samples arrive, but no sensor in them is fresh."""
 SETTLING = "settling"
 """Shown instead of that where sensors wait for their baselines."""
 

@@ -3,7 +3,7 @@
 One question decides everything: how much of this could be drift? Each taxel has an offset and knows how uncertain it
 is. A value that is above the offset by more than noise and uncertainty explain is a touch. Under a touch the offset is
 predicted from what the patch has in common, and its uncertainty grows by the drift that was measured at rest. A touch
-lasts until its load is gone, or has fallen to what drift could be. All times are those of the frames.
+lasts until its load is gone, or has fallen to what drift could be. All times are those of the samples.
 ``skinware/native`` computes all this: ``baseline.h`` has its numbers.
 """
 
@@ -124,7 +124,7 @@ _update.argtypes = (ctypes.c_void_p, ctypes.c_int64, *(ctypes.c_void_p,) * 5)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calm:
-    """One frame of n taxels, calmed. The arrays belong to the caller.
+    """One sample of n taxels, calmed. The arrays belong to the caller.
 
     Attributes:
         value: (n,) float32, how far each touched taxel is above its baseline (of types that a touch may move to both
@@ -134,10 +134,10 @@ class Calm:
         baseline: (n,) float32, what each taxel would read if nothing touched it; NaN before that is known.
         uncertainty: (n,) float32, standard deviation of the baseline, and so of ``value``, beside the noise; NaN before
             it is known.
-        noise: (n,) float32, standard deviation from frame to frame; NaN before it is known.
+        noise: (n,) float32, standard deviation from sample to sample; NaN before it is known.
         why: (n,) uint8, why each is in its state: a :class:`skinware.status.Why`.
         forced: (n,) bool, the baseline was put where the value is, at once.
-        usable: (n,) bool, value and baseline are of this frame; others show what was last known, or nothing yet.
+        usable: (n,) bool, value and baseline are of this sample; others show what was last known, or nothing yet.
     """
 
     value: Floats
@@ -274,12 +274,12 @@ class Baseline:
 
     @property
     def doubts(self) -> bool:
-        """Whether a touch seems to lower some taxels in the newest frame."""
+        """Whether a touch seems to lower some taxels in the newest sample."""
         return bool(self._words.doubts)
 
     @property
     def settings(self) -> BaselineSettings:
-        """The settings; new ones hold from the next frame on."""
+        """The settings; new ones hold from the next sample on."""
         return self._settings
 
     @settings.setter
@@ -313,7 +313,7 @@ class Baseline:
         return number
 
     def take(self, frame: DriverSnapshot) -> Calm:
-        """Calm the next frame of the driver; raises StructureError if it has no such sensors."""
+        """Calm the next sample of the driver; raises StructureError if it has no such sensors."""
         status = frame.status_of(self.type_name)
         before, suspect = self._suspect, (status & Status.SUSPECT) != 0
         self._suspect = suspect
@@ -329,14 +329,14 @@ class Baseline:
         jumped: npt.ArrayLike | None = None,
         bears: npt.ArrayLike | None = None,
     ) -> Calm:
-        """Calm the next frame, given as arrays.
+        """Calm the next sample, given as arrays.
 
         Args:
-            time_ns: of the frame, CLOCK_MONOTONIC or any other clock that goes forwards.
+            time_ns: of the sample, CLOCK_MONOTONIC or any other clock that goes forwards.
             values: (n,) in the unit of the type, more = more pressure; NaN where nothing is known.
-            usable: (n,) bool, which values are of this frame; default: all. The others keep their state, and have no
+            usable: (n,) bool, which values are of this sample; default: all. The others keep their state, and have no
                 influence on anything.
-            jumped: (n,) bool, where the hardware moved its own baseline just before this frame; default: nowhere.
+            jumped: (n,) bool, where the hardware moved its own baseline just before this sample; default: nowhere.
             bears: (n,) bool, where the vector of which a value is an axis bears a load; default: nowhere.
         """
         memory = np.empty(SHOWN * self._n, np.uint8)

@@ -34,7 +34,7 @@ class DriverSource:
         return self.reader is not None and self.reader.alive
 
     def next_frame(self) -> DriverSnapshot | None:
-        """Return the newest frame, if a newer one came within 50 ms; never the last one of a dead driver."""
+        """Return the newest sample, if a newer one came within 50 ms; never the last one of a dead driver."""
         try:
             if self.reader is None:
                 self.reader = DriverReader(self._name, namespace=self._namespace)
@@ -53,7 +53,7 @@ class DriverSource:
         return None if frame.stale else frame
 
     def has_changed(self, frame: DriverSnapshot) -> bool:
-        """Whether a frame has another structure than the frame before it."""
+        """Whether a sample has another structure than the sample before it."""
         before, self._structure = self._structure, frame.structure
         return frame.structure is not before and frame.structure != before
 
@@ -110,7 +110,7 @@ class CalmedDriver:
         self._unknown = sorted(own - set(self._copied))
 
     def begin(self, frame: DriverSnapshot) -> dict[str, npt.NDArray[Any]] | None:
-        """Return the columns of the next frame, all but values and status filled; None while paused."""
+        """Return the columns of the next sample, all but values and status filled; None while paused."""
         assert self.writer is not None  # noqa: S101 - follow() made it
         try:
             columns = self.writer.begin()
@@ -123,7 +123,7 @@ class CalmedDriver:
         return columns
 
     def publish_stale(self) -> None:
-        """Publish the last frame again, all of it stale, as the driver is dead."""
+        """Publish the last sample again, all of it stale, as the driver is dead."""
         assert self.writer is not None  # noqa: S101 - there was a frame
         columns = self.writer.begin(from_last=True)
         columns["status"] |= np.uint8(Status.STALE)

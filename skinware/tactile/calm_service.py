@@ -1,4 +1,4 @@
-"""Run the service that calms a driver: it reads the driver, takes its frames through a chain, and publishes them."""
+"""Run the service that calms a driver: it reads the driver, takes its samples through a chain, and publishes them."""
 
 from __future__ import annotations
 
@@ -73,11 +73,11 @@ class CalmRequests:
         return {name: {key: getattr(one, key) for key in one.__struct_fields__} for name, one in changed.items()}
 
     def answer(self, writer: DriverWriter) -> None:
-        """Answer the requests that have come; those for a frame wait for :meth:`published`."""
+        """Answer the requests that have come; those for a sample wait for :meth:`published`."""
         self._waiting += [(now_ns(), request) for request in writer.answer_requests()]
 
     def published(self, acquired_ns: int, writer: DriverWriter) -> None:
-        """Answer the requests for a frame that came before the newest frame was acquired."""
+        """Answer the requests for a sample that came before the newest sample was acquired."""
         for asked_ns, request in self._waiting:
             if acquired_ns >= asked_ns:
                 request.reply(position=writer.position)
@@ -112,7 +112,7 @@ class CalmService:
         health: name of the service of its sensors' health, in the same namespace; None: there is none.
 
     Attributes:
-        frames: number of frames that were taken.
+        frames: number of samples that were taken.
         contacts: the service of its contacts.
         motion: the service of the motion of regions.
         health: the service of the health of its sensors.
@@ -166,7 +166,7 @@ class CalmService:
         Args:
             report: called again and again.
             every_s: how often.
-            on_ready: called after the first frame, and after the first frame of every other structure.
+            on_ready: called after the first sample, and after the first sample of every other structure.
 
         Raises:
             NameInUse, NamespaceError: as a writer.
@@ -236,7 +236,7 @@ class CalmService:
         self._requests.chain, self._state = chain, "waiting"
 
     def _publish(self, frame: DriverSnapshot) -> bool:
-        """Calm a frame and publish it; return whether it is the first one of a structure."""
+        """Calm a sample and publish it; return whether it is the first one of a structure."""
         if self._source.has_changed(frame):
             self._follow(frame)
         chain, writer = self.chain, self._calmed.writer

@@ -73,9 +73,9 @@ class BaselineStage(Stage):
     Attributes:
         baseline: the baselines.
         before: the taxels as they come in.
-        given: (n,) float32, the values of the newest frame as they came in; the next one overwrites them.
-        shown: the same, calmed, in arrays that the next frame overwrites.
-        calm: ``shown``; None before the first frame.
+        given: (n,) float32, the values of the newest sample as they came in; the next one overwrites them.
+        shown: the same, calmed, in arrays that the next sample overwrites.
+        calm: ``shown``; None before the first sample.
     """
 
     name = "baseline"
@@ -103,7 +103,7 @@ class BaselineStage(Stage):
 
     @property
     def touched(self) -> Flags:
-        """(n,) bool, which taxels are touched in the newest frame."""
+        """(n,) bool, which taxels are touched in the newest sample."""
         return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
 
     def step(self, signal: Signal) -> None:
@@ -240,7 +240,7 @@ class Chain:
         structure: structure of the output: the same sensors, float32, with the units of the last stages.
         stages: by type.
         baseline_stages, curve_stages: by type, the first stage that is a baseline, and the last that is a curve.
-        output, flags: (n_sensors,) float32 and uint8, values and status of the newest frame; the next overwrites them.
+        output, flags: (n_sensors,) float32 and uint8, values and status of the newest sample; the next overwrites them.
         at: address of its ``struct chain``, for C.
         vectors: the types that are axes of vectors, for each stage that shows vectors.
     """
@@ -335,9 +335,9 @@ class Chain:
         return {name: stage.baseline for name, stage in self.baseline_stages.items()}
 
     def step(self, frame: DriverSnapshot, values: npt.NDArray[Any], status: Bytes) -> None:
-        """Take the next frame of the driver through all stages.
+        """Take the next sample of the driver through all stages.
 
-        Fills (n_sensors,) float32 values with the output; and (n_sensors,) uint8 status with that of the frame,
+        Fills (n_sensors,) float32 values with the output; and (n_sensors,) uint8 status with that of the sample,
         ``SUSPECT`` where a baseline was moved by force, and ``NEVER_SEEN`` where a stage has no result yet.
         """
         if self._warm:
@@ -359,7 +359,7 @@ class Chain:
         self.output[:], self.flags[:] = 0, UNUSABLE
 
     def explain(self, uncertainty: Floats, why: Bytes) -> None:
-        """Fill in (n_sensors,) how far the baselines of the newest frame can be trusted; others stay as they are."""
+        """Fill in (n_sensors,) how far the baselines of the newest sample can be trusted; others stay as they are."""
         for name, stage in self.baseline_stages.items():
             if stage.calm is not None:
                 at = self._before.span(name)

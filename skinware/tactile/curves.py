@@ -226,7 +226,7 @@ class CurveStage(Stage):
 
     Attributes:
         table: the curves.
-        temperature_c: of the skin in the next frame; NaN: not known.
+        temperature_c: of the skin in the next sample; NaN: not known.
         error: (n,) float32, standard deviations of the newest results; NaN: not known.
     """
 

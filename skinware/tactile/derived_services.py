@@ -1,7 +1,7 @@
 """Publish contacts, motion and health beside a calmed driver.
 
 They share one pattern: each follows the chain of the driver from structure to structure, publishes what it computes
-from every frame, and gives itself up on an error, as calm values are worth more than any of them.
+from every sample, and gives itself up on an error, as calm values are worth more than any of them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _HEALTH_PERIOD_NS = round(NS_PER_S / RATE_HZ)
 
 
 class DerivedService(ABC, Generic[WriterT]):
-    """A service beside a calmed driver, computed from its frames.
+    """A service beside a calmed driver, computed from its samples.
 
     If another program has a service of this name, the name of the driver and a hyphen come before it. Without a name
     there is none.
@@ -98,12 +98,12 @@ class DerivedService(ABC, Generic[WriterT]):
 class Loads:
     """The loads of n taxels of a chain: values of one type, or lengths of vectors of three; computed in C.
 
-    Contacts are those of the last type, ``type_name``. All arrays are of the newest frame, and the next one overwrites
+    Contacts are those of the last type, ``type_name``. All arrays are of the newest sample, and the next one overwrites
     them.
 
     Attributes:
         load: (n,) float32, the loads.
-        touched: (n,) bool, which taxels are touched, of those with values of this frame.
+        touched: (n,) bool, which taxels are touched, of those with values of this sample.
         more: onsets, clipped taxels, uncertainties (in the unit ``unit``; else None), and loads over noise.
     """
 
@@ -144,7 +144,7 @@ class Loads:
         return cls(chain, vectors[0]) if vectors else None
 
     def find(self) -> None:
-        """Find the loads in what the chain made of the newest frame."""
+        """Find the loads in what the chain made of the newest sample."""
         _find_loads(*self._at)
 
 
@@ -153,7 +153,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
 
     They are found in pressures, or else in another type that a touch only raises, or else in the lengths of vectors.
     Poses of coordinate frames on the robot, (4, 4) by name, let contacts hang together across their borders. ``newest``
-    are those of the newest frame, and the (n,) loads in which they were found; None: there are none.
+    are those of the newest sample, and the (n,) loads in which they were found; None: there are none.
     """
 
     kind = "contacts"
@@ -264,7 +264,7 @@ class CalmHealth(DerivedService[HealthWriter]):
             status |= self._status
 
     def update(self, acquired_ns: int) -> None:
-        """Take in what the chain made of a frame, and judge the sensors when it is time."""
+        """Take in what the chain made of a sample, and judge the sensors when it is time."""
         if self.judged is None:
             return
         self.judged.update(acquired_ns)

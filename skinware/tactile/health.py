@@ -252,7 +252,7 @@ class Health:
         )
 
     def update(self, time_ns: int, values: npt.ArrayLike, calm: Calm) -> None:
-        """Take the next frame in: when it was, its (n,) values, and what the baseline made of them."""
+        """Take the next sample in: when it was, its (n,) values, and what the baseline made of them."""
         given = np.asarray(values, np.float32)
         self._begun_ns = time_ns if self._begun_ns is None else self._begun_ns
         before_s, self._now_s = self._now_s, max(self._now_s, (time_ns - self._begun_ns) / NS_PER_S)

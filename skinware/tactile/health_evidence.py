@@ -41,13 +41,13 @@ _EVEN = 1.4  # times: the farther of two opposite neighbours is at most this muc
 
 
 class Noise:
-    """Measures the noise of n taxels again and again, by the differences from frame to frame.
+    """Measures the noise of n taxels again and again, by the differences from sample to sample.
 
     A measurement has parts, and the noise is that of its median part: a press nearby makes differences only in some of
     them, and so does the release of a load under which a baseline was taken. A noise grows slowly, as presses may be in
     most of them. ``deviation`` and ``at_end``, the share of the time at an end of the range, are NaN before they are
-    known. ``sums`` are (3, n), of squared differences, of frames, and of frames at an end of the range, of the present
-    part: of taxels that are neither touched nor far above their baselines, as at the beginning of a touch.
+    known. ``sums`` are (3, n), of squared differences, of samples, and of samples at an end of the range, of this part:
+    of taxels that are neither touched nor far above their baselines, as at the beginning of a touch.
     """
 
     def __init__(self, sums: Floats, measured_s: float) -> None:
@@ -61,7 +61,7 @@ class Noise:
         self._n_parts: Whole = np.zeros(n, np.int64)
 
     def ends(self, now_s: float) -> bool:
-        """Return whether a measurement ends with the newest frame."""
+        """Return whether a measurement ends with the newest sample."""
         if now_s - self._begun_s < self._part_s:
             return False
         self._begun_s = now_s
@@ -70,7 +70,7 @@ class Noise:
         return self._ended % _PARTS == 0
 
     def _end_parts(self) -> None:
-        """End the parts that have frames enough; the others go on."""
+        """End the parts that have samples enough; the others go on."""
         squares, frames, ends = self._sums
         enough = np.flatnonzero(frames >= _ENOUGH_FRAMES)
         part = self._n_parts[enough] % _PARTS
@@ -85,7 +85,7 @@ class Noise:
 
 
 class Use:
-    """Follows when n taxels changed, and how hard they and their modules were touched; each frame in C.
+    """Follows when n taxels changed, and how hard they and their modules were touched; each sample in C.
 
     The arrays are (n,), as ``skinware/native/health.h`` describes them. ``module_touched_s`` has the times of the last
     touches of each module, (n_modules, touches), the oldest first.
@@ -108,7 +108,7 @@ class Use:
         self._at = ctypes.addressof(self._words)
 
     def compare(self, given: Floats, calm: Calm, clear: float) -> bool:
-        """Compare the next frame with the values before it; a touch above ``clear`` is clear.
+        """Compare the next sample with the values before it; a touch above ``clear`` is clear.
 
         Returns:
             Whether a taxel has jumped: ``moved``.
@@ -120,7 +120,7 @@ class Use:
         return bool(_compare(self._at))
 
     def take(self, now_s: float, passed_s: float, clear: float) -> tuple[bool, bool]:
-        """Take the frame in; return whether there are hard touches, and plain ones."""
+        """Take the sample in; return whether there are hard touches, and plain ones."""
         self._words.clear = clear
         found = _use(self._at, now_s, passed_s)
         if found & _BEGUN:
@@ -140,7 +140,7 @@ class Dues:
         recent: the mean share of the last hard touches, each with the same weight.
         best: the largest of these means so far, at most 1; 0 before it is known well.
         exchanges: weak taxels that show what is due to others.
-        frames: number of frames so far.
+        frames: number of samples so far.
     """
 
     def __init__(self, geometry: Geometry | None, table: Table) -> None:
@@ -156,7 +156,7 @@ class Dues:
         self._compared_s = np.full(n, -math.inf)
 
     def add(self, now_s: float, above: Floats, calm: Calm, hard: Flags) -> None:
-        """Take a frame with clear touches in: its values above the baselines, and which taxels are clearly touched."""
+        """Take a sample with clear touches in: its values above the baselines, and which taxels are clearly touched."""
         if self._pairs is None:
             return
         active = np.flatnonzero(hard)

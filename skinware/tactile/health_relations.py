@@ -66,7 +66,7 @@ class Dropouts:
         self._before, self._lost = np.zeros((2, len(table)), np.float32)
 
     def add(self, now_s: float, arrays: Arrays, calm: Calm) -> None:
-        """Take in a frame in which some have moved, by the arrays of ``struct health``."""
+        """Take in a sample in which some have moved, by the arrays of ``struct health``."""
         before, given, jump, far = (arrays[name] for name in ("value", "given", "jump", "far"))
         moved = np.flatnonzero(arrays["moved"])
         moved = moved[_most_around(self._table, moved, jump) <= _STEADY * jump[moved]]
@@ -144,7 +144,7 @@ class Exchanges:
 class Copies:
     """Finds taxels that change with another of their module, while their own neighbours do not.
 
-    Changes are those of means over some frames, from what the neighbours do: a cover sags round a touch. ``total`` is
+    Changes are those of means over some samples, from what the neighbours do: a cover sags round a touch. ``total`` is
     (n,), the sum of the values so far, which begins again with each mean.
     """
 
@@ -157,7 +157,7 @@ class Copies:
         self._alone: dict[int, _Alone] = {}
 
     def add(self, now_s: float, noise: float) -> None:
-        """Take in that ``total`` has another frame; ``noise`` is that of the typical taxel."""
+        """Take in that ``total`` has another sample; ``noise`` is that of the typical taxel."""
         self._frames += 1
         if now_s - self._before_s < _CHANGE_S:
             return
@@ -256,7 +256,7 @@ class Twins:
         self._compared_s = np.full(len(table), -math.inf)
 
     def add(self, now_s: float, above: Floats, plain: Flags, calm: Calm, noise: float) -> None:
-        """Take in a frame with plain touches: its values above the baselines, and the noise of the typical taxel."""
+        """Take in a sample with plain touches: its values above the baselines, and the noise of the typical taxel."""
         rows = np.flatnonzero(plain)[:_MOST_COMPARED]
         if not self._table.shape[1]:
             return

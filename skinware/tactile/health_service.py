@@ -1,7 +1,7 @@
 """Judge all sensors of a driver; publish and read it: the service ``health``, once a second, with the reasons.
 
 Columns of a sample: those of :data:`skinware.tactile.health.COLUMNS`, of all sensors of the driver in the order
-of its frames. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns:
+of its samples. Nothing is known of types without a rest: ``kind`` is 0 and numbers are NaN. Static columns:
 ``sensor_uid``, ``sensor_type``, and the name of the ``driver``.
 """
 
@@ -123,7 +123,7 @@ class ChainHealth:
         return bool(self._watched)
 
     def update(self, time_ns: int) -> None:
-        """Take in what the chain made of the frame of this time."""
+        """Take in what the chain made of the sample of this time."""
         for stage, health in self._watched.values():
             if stage.calm is not None:
                 health.update(time_ns, stage.given, stage.calm)

@@ -53,7 +53,7 @@ class RegionMotion:
 
 @dataclass(frozen=True, eq=False)
 class MotionSet:
-    """The motion of all r regions in one frame; a sequence of :class:`RegionMotion`.
+    """The motion of all r regions in one sample; a sequence of :class:`RegionMotion`.
 
     Each of :data:`COLUMNS` is an array (r, ...); ``names`` are those of the regions, ``frames`` those that ``frame``
     counts.
@@ -97,7 +97,7 @@ COLUMNS: Columns = {
 
 
 def motion_of(regions: Mapping[str, Index], contacts: ContactSet, value: npt.NDArray[Any]) -> MotionSet:
-    """Return the motion of regions, from the contacts of a frame and (n,) calmed values.
+    """Return the motion of regions, from the contacts of a sample and (n,) calmed values.
 
     The velocity of a region leaves out contacts in other coordinate frames than the one with most of its load. Regions
     are, by name, positions among the n taxels: a slice or (m,) int64, as :meth:`.Regions.of` gives them.
@@ -135,7 +135,7 @@ _FORM = ServiceForm(
 
 
 class MotionSample(SourceSample):
-    """The motion of all regions in one frame; iterate over it for each of them."""
+    """The motion of all regions in one sample; iterate over it for each of them."""
 
     __slots__ = ()
 
@@ -190,7 +190,7 @@ class MotionWriter(SourceWriter):
         super().__init__(source, name, **options)
 
     def publish(self, contacts: ContactSet, value: npt.NDArray[Any], acquired_ns: int) -> MotionSet:
-        """Publish the motion of the next frame, by its contacts and (n,) calmed values.
+        """Publish the motion of the next sample, by its contacts and (n,) calmed values.
 
         Raises as ``begin``.
         """

@@ -1,4 +1,4 @@
-"""Turn contacts into events: some begin within two frames, before a baseline has confirmed them."""
+"""Turn contacts into events: some begin within two samples, before a baseline has confirmed them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class EventKind(enum.IntEnum):
     """A moment in the life of a contact."""
 
     ONSET = 0
-    """It has begun, provisionally: nothing but the last frames speak for it."""
+    """It has begun, provisionally: nothing but the last samples speak for it."""
     CONFIRMED = 1
     """It is a contact: the baseline agrees. Where it does so at once, this is the first event."""
     WITHDRAWN = 2
@@ -32,7 +32,7 @@ class EventKind(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class ContactEvent:
-    """An event: its kind, its contact (at the end, as it was last seen), and when the frame of it was acquired, ns."""
+    """An event: its kind, its contact (at the end, as it was last seen), and when the sample of it was acquired, ns."""
 
     kind: EventKind
     contact: Contact
@@ -40,13 +40,13 @@ class ContactEvent:
 
 
 class Events:
-    """Turns the contacts of frames into events."""
+    """Turns the contacts of samples into events."""
 
     def __init__(self) -> None:
         self._seen: dict[int, tuple[Contact, int]] = {}
 
     def of(self, contacts: ContactSet, acquired_ns: int) -> list[ContactEvent]:
-        """Return the events since the last frame, by the contacts of the newest, and when that was acquired."""
+        """Return the events since the last sample, by the contacts of the newest, and when that was acquired."""
         found = []
         for contact in contacts:
             before = self._seen.get(contact.id)

@@ -210,7 +210,7 @@ class SensorChoice:
         yield from unknown("region", self.in_regions, [region.name for region in self.regions])
 
     def of(self, driver: str, structure: Structure) -> Flags:
-        """Return (n_sensors,) bool: the chosen sensors of a driver, in the order of its frames."""
+        """Return (n_sensors,) bool: the chosen sensors of a driver, in the order of its samples."""
         wanted, layout = np.zeros(structure.n_sensors, bool), SkinLayout((driver,), (structure,))
         for name in [each.name for each in structure.types if not self.types or each.name in self.types]:
             inside = np.full(len(structure.module_of(name)), not self.in_regions)

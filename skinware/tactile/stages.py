@@ -1,4 +1,4 @@
-"""Filter, scale and amplify the values of n taxels of one type, frame by frame: the stages of a chain.
+"""Filter, scale and amplify the values of n taxels of one type, sample by sample: the stages of a chain.
 
 Each can be used alone: make it from its settings with ``stage(taxels)``, and change a :class:`Signal` with ``step``.
 The settings of a stage are also its entry in the file of a chain.
@@ -36,14 +36,14 @@ STRUCTS = read_structs([Path(native.__file__).with_name("chain.h")])
 
 
 class Signal:
-    """One frame of n taxels on its way through stages, which change its arrays in place.
+    """One sample of n taxels on its way through stages, which change its arrays in place.
 
     ``index`` is (n,) where they stand in a snapshot.
 
     Attributes:
-        time_ns: time of the frame.
+        time_ns: time of the sample.
         values: (n,) float32.
-        usable: (n,) bool, which values are of this frame.
+        usable: (n,) bool, which values are of this sample.
         jumped: (n,) bool, where the hardware moved its own baseline just before it.
         forced: (n,) bool, where a stage moved a baseline by force.
         bears: (n,) bool, where the vector of which a value is an axis bears a load.
@@ -133,7 +133,7 @@ class Stage(ABC):
         self._time_ns: int | None = None
 
     def _passed_s(self, signal: Signal) -> float:
-        """The seconds since the frame before; 0 for the first."""
+        """The seconds since the sample before; 0 for the first."""
         before_ns, self._time_ns = self._time_ns, signal.time_ns
         return 0.0 if before_ns is None else max(0, signal.time_ns - before_ns) / NS_PER_S
 
@@ -152,7 +152,7 @@ class Stage(ABC):
 
     @abstractmethod
     def step(self, signal: Signal) -> None:
-        """Change one frame in place, of each type where it is for several; frames come in the order of their times."""
+        """Change one sample in place, of each type where it is for several; samples come in order of time."""
 
 
 class StageSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="stage"):
@@ -174,9 +174,9 @@ class FilterSettings(StageSettings, frozen=True, kw_only=True, tag="filter"):
     """Settings of a filter that smooths each taxel over time; the unit stays.
 
     Attributes:
-        method: ``lowpass`` of first order, ``mean`` or ``median`` of the last frames.
+        method: ``lowpass`` of first order, ``mean`` or ``median`` of the last samples.
         tau_s: time constant of ``lowpass``, s.
-        frames: number of frames for ``mean`` and ``median``, 2 to 99.
+        frames: number of samples for ``mean`` and ``median``, 2 to 99.
     """
 
     method: Literal["lowpass", "mean", "median"] = "lowpass"

@@ -89,7 +89,7 @@ class ThermalGains:
 
 
 class ThermalStage(Stage):
-    """Takes what temperatures have changed since its first frame off the values of n taxels."""
+    """Takes what temperatures have changed since its first sample off the values of n taxels."""
 
     name = "thermal"
 

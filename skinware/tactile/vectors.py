@@ -74,17 +74,17 @@ class ArrayField:
 
     @property
     def now(self) -> Doubles:
-        """(arrays, 3) the change of the field at each array since its first frame; a copy."""
+        """(arrays, 3) the change of the field at each array since its first sample; a copy."""
         return np.array([list(array.field) for array in self._memory]).reshape(-1, 3)
 
     @property
     def bears(self) -> Flags:
-        """(n,) bool, which taxels bear a load in the newest frame; a copy."""
+        """(n,) bool, which taxels bear a load in the newest sample; a copy."""
         bears: Flags = self._arrays["bears"].copy()
         return bears
 
     def update(self, values: Floats, usable: Flags, passed_s: float) -> tuple[Floats, Flags]:
-        """Take in (3, n) float32 values, (n,) bool usable, and the seconds since the frame before.
+        """Take in (3, n) float32 values, (n,) bool usable, and the seconds since the sample before.
 
         Returns:
             (3, n) float32, the values without level and field; and (n,) bool, which of them are certain enough to say

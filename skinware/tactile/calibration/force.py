@@ -34,7 +34,7 @@ _POOR = 0.1  # share of the largest force: a larger residual makes a fit worth l
 
 @dataclass(frozen=True)
 class ForceData:
-    """m frames of n taxels with a reference.
+    """m samples of n taxels with a reference.
 
     Attributes:
         time_s: (m,) rising.
@@ -55,10 +55,10 @@ class ForceFit:
     Attributes:
         curve: the curve of a taxel whose gain is 1.
         gain: (n,) of each; NaN: it was not pressed.
-        residual_n: root of the mean square of the errors in frames that the fit had not seen, N.
+        residual_n: root of the mean square of the errors in samples that the fit had not seen, N.
         reach_n: the largest force of the reference, N.
         hysteresis: the largest part of the range by which rising and falling load differ.
-        held: share of the frames, unseen by the fit, whose error is within 1.96 standard deviations.
+        held: share of the samples, unseen by the fit, whose error is within 1.96 standard deviations.
         presses: number of presses that were apart in time.
     """
 
@@ -89,10 +89,10 @@ class ForceFit:
 
 
 def fit_force(data: ForceData, type_name: str = "pressure", from_unit: str = "counts") -> ForceFit:
-    """Fit curves in N to frames with a reference: loads that rise, rest and fall, over the wanted range.
+    """Fit curves in N to samples with a reference: loads that rise, rest and fall, over the wanted range.
 
     Raises:
-        ConfigurationError: too few frames with a load, or loads that do not vary.
+        ConfigurationError: too few samples with a load, or loads that do not vary.
     """
     pressed = np.flatnonzero((data.load > 0).any(axis=0))
     used = np.isfinite(data.force_n) & (data.load > 0).any(axis=1)
@@ -152,7 +152,7 @@ def _lived(time_s: Doubles, load: Doubles, play: float, creep_s: float) -> Doubl
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Linear terms (terms, frames, taxels) of the frames that count, for one play and one time constant."""
+    """Linear terms (terms, samples, taxels) of the samples that count, for one play and one time constant."""
 
     force_n: Doubles
     terms: Doubles
@@ -200,7 +200,7 @@ class _Trial:
 def _errors(problem: _Trial, presses: int) -> tuple[tuple[float, float], float, float]:
     """Standard deviation of a taxel at 0 N and its growth with the force; the whole residual; the share that it holds.
 
-    All is of frames that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
+    All is of samples that the fit had not seen: each tenth of them in turn, half of which scale the deviations.
     Deviations of the taxels of a contact add up to the deviation of its force.
     """
     left, expected = (np.zeros_like(problem.force_n) for _ in range(2))

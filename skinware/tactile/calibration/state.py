@@ -35,7 +35,7 @@ class PressSettings:
 
 @dataclass
 class PressFinder:
-    """Finds presses in frames: one each time that something comes to rest on the skin.
+    """Finds presses in samples: one each time that something comes to rest on the skin.
 
     Attributes:
         settings: the conditions of a press.
@@ -50,10 +50,10 @@ class PressFinder:
     """The last two points of its way that are apart by more than it may move while it rests."""
 
     def update(self, time_ns: int, load: npt.NDArray[Any], pose: Doubles | None) -> Press | None:
-        """Take a frame, and return the press that is complete with it.
+        """Take a sample, and return the press that is complete with it.
 
         Args:
-            time_ns: of the frame.
+            time_ns: of the sample.
             load: (n,) 0 where nothing touches, NaN where it is not known.
             pose: (3,) or (4, 4), at that time; None or not finite: not known.
         """
@@ -120,7 +120,7 @@ class Session(ABC):
     @property
     @abstractmethod
     def figures(self) -> dict[str, int]:
-        """Numbers of presses or frames so far."""
+        """Numbers of presses or samples so far."""
 
     @abstractmethod
     def arrays(self) -> Arrays:
@@ -231,7 +231,7 @@ class ForceSession(Session):
 
     @property
     def data(self) -> ForceData:
-        """All frames so far."""
+        """All samples so far."""
         loads = np.array([load for _, load, _ in self._frames]).reshape(-1, self._n)
         force_n, temperature_c = np.array([pose for *_, pose in self._frames]).reshape(-1, 2).T
         return ForceData(np.array([time_s for time_s, *_ in self._frames]), loads, force_n, temperature_c)
@@ -261,7 +261,7 @@ class ForceSession(Session):
 
 
 ENOUGH_PRESSED = 100
-"""Frames with a load after which a taxel has enough for a curve."""
+"""Samples with a load after which a taxel has enough for a curve."""
 _VERSION = 2
 _OF_PRESSES = ("pose", "press", "taxel", "load", "motion")
 _ARRAYS = "gathered/"

@@ -15,18 +15,18 @@ from skinware.tactile.neighbours import Components, neighbours_of_pairs
 MOST_TAXELS = 6000
 """Every taxel is compared with every other one: this many need 290 MB."""
 ENOUGH_FRAMES = 20
-"""Frames with a touch after which a taxel is covered."""
+"""Samples with a touch after which a taxel is covered."""
 _LEAST_FRAMES = 8  # frames with a touch from which a taxel counts: in fewer it may be noise
 
 
 @dataclass
 class StrokeSums:
-    """The sums over all frames from which a topology is computed.
+    """The sums over all samples from which a topology is computed.
 
     Attributes:
         products: (n, n) float64, sum of the products of the loads of each pair of taxels.
-        active: (n,) int64, frames in which each was touched.
-        frames: number of frames in which any was touched.
+        active: (n,) int64, samples in which each was touched.
+        frames: number of samples in which any was touched.
     """
 
     products: Doubles
@@ -35,7 +35,7 @@ class StrokeSums:
 
     @classmethod
     def empty(cls, n: int) -> Self:
-        """Make the sums of n taxels before the first frame; raises ConfigurationError if there are too many."""
+        """Make the sums of n taxels before the first sample; raises ConfigurationError if there are too many."""
         if n > MOST_TAXELS:
             raise ConfigurationError(f"{n} taxels: a topology is found of at most {MOST_TAXELS} at a time")
         return cls(np.zeros((n, n)), np.zeros(n, np.int64))
@@ -44,7 +44,7 @@ class StrokeSums:
         return len(self.active)
 
     def add(self, load: npt.NDArray[Any]) -> None:
-        """Take one frame or many: (n,) or (m, n) loads, 0 where nothing touches, NaN where it is not known."""
+        """Take one sample or many: (n,) or (m, n) loads, 0 where nothing touches, NaN where it is not known."""
         loads = np.nan_to_num(np.atleast_2d(np.asarray(load, np.float64)), posinf=0.0)
         np.maximum(loads, 0, out=loads)
         loads = loads[(loads > 0).any(axis=1)]
@@ -58,7 +58,7 @@ class StrokeSums:
 
     @property
     def known(self) -> Flags:
-        """(n,) bool: touched in enough frames to be compared with others."""
+        """(n,) bool: touched in enough samples to be compared with others."""
         return self.active >= _LEAST_FRAMES
 
     def similarity(self) -> Doubles:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from skinware.geometry import Geometry
+from skinware.nominal_hand import FINGERS
+from skinware.tactile.contacts import Contacts
+from skinware.tactile.neighbours import neighbours
+from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.virtual import on_a_grid, on_pads
 from skinware_drivers.virtual.emulator import WanderingPress
 
@@ -46,3 +51,18 @@ def test_places_without_pads_are_one_pad() -> None:
     press = WanderingPress(0, 1, on_a_grid(16, 4)[:, :2])
     assert np.array_equal(press.strength(2.0), WanderingPress(0, 1, on_a_grid(16, 4)).strength(2.0))
     assert press.strength(2.0).max() > 0.9
+
+
+def test_each_press_of_a_hand_is_one_contact_with_one_identity() -> None:
+    grid, hand = Grid(12, 6), Hand("right")
+    at = [
+        grid.at(hand.down(finger, [grid])[0], ["force"], range(72 * n, 72 * n + 72)) for n, finger in enumerate(FINGERS)
+    ]
+    places, press = Geometry.joined(at), WanderingPress(0, 1, on_pads(*[(72, 6)] * 5))
+    contacts, most, identities = Contacts(len(places), neighbours(places), places), 0, set[int]()
+    for number in range(20 * 30):
+        load = np.rint(200 * press.strength(number / 20))
+        found = contacts.update(load, load > 4, number * 50_000_000)
+        most = max(most, len(found))
+        identities |= set(found.id.tolist())
+    assert (most, identities) == (1, set(range(1, 7)))

@@ -17,7 +17,6 @@ from skinware.tactile.tracks import (
     assign,
     correct,
     expected_at,
-    is_shared,
     judge,
     move,
     without_nan,
@@ -146,7 +145,8 @@ class Tracker:
         expected["jumps"][home >= 0] |= is_joined.sum(axis=0)[home[home >= 0]] > 1
         expected["home"] = home
         tracks = self._with_new(expected, blobs, time_ns)
-        tracks["shared"] = is_shared(tracks["home"])
+        in_blob = np.bincount(tracks["home"] + 1)
+        tracks["shared"] = (tracks["home"] >= 0) & (in_blob[tracks["home"] + 1] > 1)
         self._find(tracks, blobs, size, time_ns)
         move(tracks, before, self._settings.velocity_s)
         judge(tracks, before, time_ns, self._judged_by)

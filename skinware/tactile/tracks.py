@@ -84,14 +84,6 @@ class TouchedBlobs:
     frames: Whole
 
 
-def is_shared(home: Whole) -> Flags:
-    """(tracks,) which of them share their blob with others."""
-    count = np.bincount(home + 1, minlength=1)
-    count[0] = 0
-    shared: Flags = count[home + 1] > 1
-    return shared
-
-
 def expected_at(tracks: Tracks, time_ns: int) -> Tracks:
     """The tracks as they are expected at a time: places and spreads go on with the velocities."""
     expected = tracks.copy()

@@ -222,7 +222,7 @@ def test_a_controller_without_sensors() -> None:
 
 def test_on_a_port() -> None:
     """A press is felt by pillars at their places, and by the whole sensor."""
-    with emulated_skin("papillarray", name="gripper") as skin:
+    with emulated_skin("papillarray", name="gripper", driver_options={"rate_hz": 100}) as skin:
         frame = read_until(skin.reader, lambda f: bool((f.physical("total_force_z") > 2).all()))
         structure = frame.structure
         assert structure.patch_name.tolist() == [b"PapillArray"]

@@ -14,11 +14,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import numpy.typing as npt
 from onnx import TensorProto, helper, numpy_helper
 
 import skinware
@@ -328,6 +329,13 @@ def touch_a_hand(stopped: Sequence[int]) -> Callable[[], None]:
         writer.close()
 
     return end
+
+
+def images() -> Iterator[tuple[npt.NDArray[np.uint8], int]]:
+    """Yield ten images of a camera, each with the time at which it was taken, CLOCK_MONOTONIC ns."""
+    for number in range(10):
+        time.sleep(1 / 30)
+        yield np.full((48, 64, 3), number, np.uint8), time.monotonic_ns() - 12_000_000
 
 
 def make_grasp_trials() -> None:

@@ -5,6 +5,7 @@
     format = "skinware-binding"
     version = 1
     scene = "pad.xml"                     # beside this file
+    carrier = "thumb_tip"                 # body whose pose in the frame of the first module's the service joints has
 
     [transfer]                            # of every module: see TransferSettings
     counts_per_n = 300
@@ -25,8 +26,6 @@
 
     [pose.open]                           # targets of actuators
     left = 0.03
-
-    carrier = "thumb_tip"                 # body whose pose in the frame of the first module's the service joints has
 
     [[move]]                              # what the scene does by itself
     at_s = 1.0

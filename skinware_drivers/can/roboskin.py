@@ -171,7 +171,7 @@ class RoboskinDriver(BoardOperations, CanAdapter[RoboskinOptions]):
 
     @operation(sets_up=True)
     async def rate(self, link: Link, patches: Sequence[Patch], hz: float) -> float:
-        """Change how often all boards of the bus send, 4 to 1000 times a second; the baseline moves with it."""
+        """Change how often all boards of the bus send, 3.93 to 1000 times a second; the baseline moves with it."""
         period_ms = round(1e3 / hz) if hz > 0 else 0
         if not 1 <= period_ms <= 255:
             raise ConfigurationError(f"{hz:g} Hz: boards send every 1 to 255 ms, so give 3.93 to 1000 Hz")

@@ -263,7 +263,7 @@ class Revo2Driver(ModbusAdapter[Revo2Options]):
             raise BusError(f"hands of the edition {self._said.edition} have no such registers")
         await self._set(link, registers, _CALIBRATING_S)
 
-    @operation()
+    @operation(looks=True)
     async def names(self, link: Link, patches: Sequence[Patch]) -> str:  # noqa: ARG002
         """Return serial number and firmware as the hand reports them."""
         return await self._ask_names(link)

@@ -230,7 +230,7 @@ class OpenPatchDriver(SerialAdapter[OpenPatchOptions]):
         self._modules(module)
         await self._ask(link, TARE, bytes((module,)), timeout_s=_TARE_TIMEOUT_S, tries=1)
 
-    @operation()
+    @operation(looks=True)
     async def counts(self, link: Link, patches: Sequence[Patch]) -> dict[str, Any]:  # noqa: ARG002
         """Return the patch's counters: uptime_s, sent, dropped, bad_requests."""
         return asdict(Report.read(await self._ask(link, STATUS)))

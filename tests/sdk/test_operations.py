@@ -15,7 +15,8 @@ from skinware.realtime import now_ns
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
-from skinware_drivers.operations import operation
+from skinware_drivers.operations import operation, operations_of
+from skinware_drivers.registry import DRIVERS, load_driver, registered
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
@@ -244,3 +245,10 @@ def test_a_driver_that_publishes_on_request_only_makes_a_removed_socket_again(na
         reader.request()
         namespace.socket_path("roboskin").unlink()
         wait_until(namespace.socket_path("roboskin").exists)
+
+
+@pytest.mark.parametrize("driver", sorted(registered(DRIVERS)))
+def test_what_only_returns_something_needs_no_confirmation(driver: str) -> None:
+    for name, declared in operations_of(load_driver(driver), alone=True).items():
+        returns = (declared.method.__doc__ or "").startswith("Return ")
+        assert declared.looks or not returns, f"{driver}: {name} changes nothing: declare looks=True"

@@ -1,4 +1,4 @@
-/* reflex.c: acts on a touch within two frames; reflex [NAMESPACE] prints each onset and the age of its frame. */
+/* reflex.c: acts on a touch within two samples; reflex [NAMESPACE] prints each onset and the age of its sample. */
 #define SKINWARE_IMPLEMENTATION
 #include <skinware.h>
 
@@ -19,7 +19,7 @@ static void act(uint32_t identity) {
     (void)identity; /* stop the hand, or let go: whatever must not wait */
 }
 
-/* Contacts that were not there in the last frame. */
+/* Contacts that were not there in the last sample. */
 static void look(const skinware_frame *frame, const struct contacts *contacts) {
     static uint32_t known[64], n_known;
     const uint32_t count = *(const uint32_t *)skinware_data(frame, contacts->count);
@@ -50,7 +50,7 @@ int main(int argc, char **argv) {
         return 1;
     }
     look_up(reader, &contacts);
-    for (;;) { /* run it with chrt -f 41 */
+    for (;;) { /* run it with chrt -f 42 */
         result = skinware_wait(reader, &frame, skinware_now_ns() + 1000000000);
         if (result == SKINWARE_OK && skinware_read(reader, &frame) == SKINWARE_OK)
             look(&frame, &contacts);

@@ -1,6 +1,6 @@
-"""Act on a touch within two frames: python reflex.py [NAMESPACE [JOINTS]].
+"""Act on a touch within two samples: python reflex.py [NAMESPACE [JOINTS]].
 
-Prints each event, and the age of its frame before and after the action.
+Prints each event, and the age of its sample before and after the action.
 
 JOINTS is the service of the hand's joints, in the default namespace, which stops at the request ``hold``: that of a
 simulated hand (``skin-emulate --world mujoco:gripper``), or one that the program of your hand publishes.
@@ -26,7 +26,7 @@ def act(joints: ServiceReader[Any] | None) -> None:
 def main() -> None:
     """Entry point."""
     namespace = sys.argv[1] if len(sys.argv) > 1 else "calm"
-    Profile.fifo(41).apply()  # ahead of the drivers; refused without the right, with a warning
+    Profile.fifo(42).apply()  # ahead of driver and skin-calm; refused without the right, with a warning
     with ExitStack() as stack:
         contacts = stack.enter_context(ContactsReader(namespace=namespace, timeout_s=10))
         joints = stack.enter_context(ServiceReader(sys.argv[2], timeout_s=10)) if len(sys.argv) > 2 else None

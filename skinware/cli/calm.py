@@ -79,7 +79,7 @@ def command(
 ) -> None:
     """Publish driver NAME, or the only one, again in another namespace, with 0 where nothing touches it.
 
-    In the first seconds the untouched skin is measured. Restarts and changes of the driver do not end it. A restart of
+    In the first seconds the unpressed skin is measured. Restarts and changes of the driver do not end it. A restart of
     skin-calm itself keeps baselines for 10 minutes. Programs can call operations: tare, hold, change settings. It also
     publishes the contacts of the driver, of pressure sensors if there are any, and the health of its sensors: those
     with a fault (stuck, noisy, dead ...) get the status UNHEALTHY (skin-info --health shows why).

@@ -69,6 +69,7 @@ class Drivers(Generic[ReaderT]):
         self.trouble = ""
         self._inodes: dict[str, int] = {}  # of the last look
         self._refused: dict[str, _Refusal] = {}
+        self._newest: dict[str, Sample] = {}
 
     @property
     def unreadable(self) -> dict[str, str]:
@@ -144,6 +145,20 @@ class Drivers(Generic[ReaderT]):
             return reader.latest()
         except Overrun:
             return None
+
+    def newest_of_living(self, name: str) -> Any:
+        """Return the newest sample of a service, the same object while there is no newer one; never wait.
+
+        Returns:
+            None if it is not followed, has published nothing since it began, or its writer is dead.
+        """
+        newer = self.newest(name, newer_than=self._newest.get(name))
+        if newer is not None:
+            self._newest[name] = newer
+        sample, reader = self._newest.get(name), self.readers.get(name)
+        if sample is None or reader is None or not reader.alive or reader.newest_position is None:
+            return None
+        return sample if sample.generation == reader.newest_position[0] else None
 
     def wake_words(self) -> list[tuple[futex.Word, int]]:
         """Return what :func:`skinware.memory.futex.sleep_on` takes; call it before looking for what is new."""

@@ -199,21 +199,11 @@ class LiveBridges(Drivers[BridgeReader]):
 class LiveSources(Drivers[SourceReader[SampleT]], Generic[SampleT]):
     """The services of one kind in a namespace, each of which is about one driver."""
 
-    def __init__(self, namespace: Namespace, reader: Callable[..., SourceReader[SampleT]]) -> None:
-        super().__init__(namespace, reader)
-        self._known: dict[str, SampleT] = {}
-
     def of(self, driver: str) -> SampleT | None:
         """Return the newest sample of the service for a driver; None where no living service has one."""
         name = next((name for name, reader in self.readers.items() if reader.source.driver == driver), "")
-        newer: SampleT | None = self.newest(name, newer_than=self._known.get(name))
-        if newer is not None:
-            self._known[name] = newer
-        known, reader = self._known.get(name), self.readers.get(name)
-        if known is None or reader is None or not reader.alive:
-            return None
-        newest = reader.newest_position  # None, or of another generation: it has begun again
-        return known if newest is not None and newest[0] == known.generation else None
+        sample: SampleT | None = self.newest_of_living(name)
+        return sample
 
 
 class TouchedPlace(NamedTuple):

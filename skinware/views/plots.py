@@ -238,7 +238,6 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot]
     """Return a function of a snapshot: (m,) the sums of the values of each line's sensors; the highest of pressures."""
     of_lines = [_sensors_of(driver, line) for line in lines]
     has_sensors = np.array([len(sensors) > 0 for sensors in of_lines], bool)
-    are_single = all(len(sensors) == 1 for sensors in of_lines)
     some = [sensors for sensors in of_lines if len(sensors)]
     at = np.concatenate([np.zeros(0, np.int64), *some])
     scale, offset = _units_of(driver.structure, at)
@@ -252,9 +251,6 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot]
             return found
         values = frame.values[at] * scale + offset
         unknown = np.isnan(values) | ((frame.status[at] & _NO_VALUE) != 0)
-        if are_single:
-            values[unknown] = np.nan
-            return values
         values[unknown] = 0
         of_lines = np.where(highest, np.maximum.reduceat(values, starts), np.add.reduceat(values, starts))
         of_lines[np.logical_and.reduceat(unknown, starts)] = np.nan

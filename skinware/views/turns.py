@@ -201,7 +201,6 @@ class Viewer:
             "generation": str(driver.generation),
             "acquired_ns": str(frame.acquired_ns),
             "scale": picture.scale,
-            "unit": quantity.type.unit,
             "levels": blobs.add(picture.levels, "u1"),
             "contacts": self._contacts(driver, quantity, newest),
             "regions": [
@@ -210,7 +209,6 @@ class Viewer:
                     "value": region.load,
                     "unit": newest.motion.source.unit,
                     "touched": region.contacts > 0,
-                    "speed": region.speed_m_s,
                 }
                 for region in newest.motion
             ]
@@ -260,7 +258,6 @@ class Viewer:
                     "area_m2": contact.area_m2,
                     "speed": float(np.linalg.norm(contact.velocity_m_s)),
                     "age_s": contact.age_s,
-                    "taxels": contact.n,
                 }
             )
         return contacts
@@ -326,7 +323,6 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
                 "uid": blobs.add(structure.sensor_uid[index], "<u8"),
                 "patch": blobs.add(structure.sensor_patch[index], "<u2"),
                 "module": blobs.add(pads.of_sensor[index], "<u2"),
-                "names": "lazy",
                 "position": blobs.add(placed.position, "<f4"),
                 "normal": blobs.add(placed.normal, "<f4"),
                 "radius": blobs.add(placed.radius, "<f4"),

@@ -113,7 +113,6 @@ class FakeDriver:
             "uid": np.arange(self.n, dtype=np.uint64) + 0x70000,
             "patch": (np.arange(self.n) // (10 * self.triangles)).astype(np.uint16),
             "module": (np.arange(self.n) // 10).astype(np.uint16),
-            "names": "lazy",
             "position": self.position,
             "normal": self.normal,
             "radius": np.full(self.n, 0.002, np.float32),

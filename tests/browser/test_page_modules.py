@@ -431,7 +431,7 @@ def test_no_taxels_and_a_single_one(tell: Callable[..., Any]) -> None:
 # -- picking.js, overlay.js ----------------------------------------------------------------------------------------
 
 PICK = """m.pick({
-    project: (x, y, z) => [x, y, z], pixels: 40, far: 100, camera: { position: { x: 0, y: 0, z: -100 } },
+    project: (x, y, z) => [x, y, z], pixels: 40, camera: { far: 100, position: { x: 0, y: 0, z: -100 } },
 }, [{ n: 4, radius: [5, 5, 5, 5],
       position: [20, 20, 10,  20, 20, 20,  90, 20, 10,  60, 60, 10],
       normal: [0, 0, 1,  0, 0, -1,  0, 0, 0,  0, 0, 1] }], a[0], a[1])?.i ?? null"""

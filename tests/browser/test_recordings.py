@@ -16,7 +16,7 @@ from skinware.memory.namespace import Namespace
 from skinware.recording.files import Files
 from skinware.recording.recorder import Recorder
 from skinware_drivers.testing.waiting import wait_until
-from tests.browser.browsing import RAW_SCALE, level, look, places, role, tell, until, viewing
+from tests.browser.browsing import DRIVER, RAW_SCALE, level, look, places, role, tell, until, viewing
 from tests.browser.sleeve import Sleeve
 from tests.cli.fake_skin import publishing
 
@@ -88,6 +88,7 @@ def test_a_plot_has_the_times_of_the_recording(address: str, recording: Path, op
         series = opened["sleeve"].read(type_name="pressure")
     page = open_page(f"{address}#{RAW_SCALE}&t=1.000")
     until(page, "skin.replays[0]?.time_s === 1")
+    until(page, f"skin.pixelOf({DRIVER}, 0)")
     x, y = places(page, [0])[0]
     page.mouse.move(x, y)
     until(page, "skin.hovered")

@@ -70,7 +70,6 @@ def test_raw_levels_are_the_values(serving: Serve) -> None:
         assert np.abs(picture["levels"] - expected).max() <= 1
         assert picture["levels"][5] == 255
         assert picture["scale"] == [0.0, 255.0]
-        assert picture["unit"] == "counts"
         assert np.array_equal(page.status[0, "pressure"], skin.status[where])
         page.say("look", mode="raw", type="temperature", scale=[0, 100])
         picture = page.pull_picture(condition=lambda picture: picture["type"] == "temperature")
@@ -211,7 +210,7 @@ def test_what_is_calm_and_its_contacts(serving: Serve, calm_namespace: Namespace
         contacts.publish(value, value > 0, 10**9)
         page.say("look", mode="change")
         (contact,) = page.pull_picture(condition=lambda picture: picture["contacts"])["contacts"]
-        assert (contact["taxels"], contact["kind"]) == (2, "touch")
+        assert contact["kind"] == "touch"
         assert contact["load"] == pytest.approx(120)
         middle = geometry.position_m[[2, 3]].mean(axis=0) + np.array([1, 2, 3])
         assert contact["position"] == pytest.approx(middle.tolist(), abs=1e-6)

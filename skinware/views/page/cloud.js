@@ -133,10 +133,6 @@ export class Cloud {
       this.points[1].visible = marks.some((mark) => mark & ~DIMMED);
     }
   }
-
-  dispose() {
-    this.geometry.dispose();
-  }
 }
 
 function bytes(n) {

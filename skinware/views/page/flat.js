@@ -153,7 +153,6 @@ export class Flat {
   }
 }
 
-
 /** One packed colour over another, of which a share of the pixel is covered. */
 function blended(under, over, share) {
   let mixed = 0;

@@ -19,16 +19,13 @@ export class Past {
   push(sheet, at_ms) {
     if (!this.#series.has(sheet)) this.#series.set(sheet, []);
     const series = this.#series.get(sheet);
-    const before = series.at(-1);
-    const status = before && same(before.status, sheet.status) ? before.status : sheet.status.slice();
     const kept = { at_ms, bytes: CONTACT_BYTES * (sheet.contacts?.length ?? 0) };
     for (const part of PARTS) {
-      const isArray = ArrayBuffer.isView(sheet[part]) && part !== "status";
-      kept[part] = isArray ? sheet[part].slice() : sheet[part];
-      if (isArray) kept.bytes += kept[part].byteLength;
+      const isNew = ArrayBuffer.isView(sheet[part]) && part !== "status";
+      kept[part] = isNew ? sheet[part].slice() : sheet[part]; // a status is one array until it changes
+      if (isNew) kept.bytes += kept[part].byteLength;
     }
-    kept.status = status;
-    kept.bytes += status === before?.status ? 0 : status.length;
+    if (sheet.status !== series.at(-1)?.status) kept.bytes += sheet.status.byteLength;
     series.push(kept);
     this.bytes += kept.bytes;
     this.#forget(at_ms);
@@ -38,14 +35,7 @@ export class Past {
   at(sheet, at_ms) {
     const series = this.#series.get(sheet);
     if (!series?.length) return null;
-    let low = 0;
-    let high = series.length;
-    while (low < high) {
-      const middle = (low + high) >> 1;
-      if (series[middle].at_ms <= at_ms) low = middle + 1;
-      else high = middle;
-    }
-    return series[Math.max(low - 1, 0)];
+    return series[Math.max(series.findLastIndex((kept) => kept.at_ms <= at_ms), 0)];
   }
 
   /** The time of the oldest picture, ms; null if there is none. */
@@ -74,8 +64,4 @@ export class Past {
       this.bytes -= oldest.shift().bytes;
     }
   }
-}
-
-function same(one, other) {
-  return one === other || (one.length === other.length && one.every((byte, i) => byte === other[i]));
 }

@@ -175,7 +175,7 @@ function turn(message) {
     if (header.pictures) names.hold();
   }
   if (performance.now() - now.figures_ms > FIGURES_EVERY_MS) showFigures();
-  else plotting.strips.follow();
+  else plotting.strips.draw(false);
   afterFrame(() => link.next());
 }
 
@@ -423,6 +423,12 @@ function go({ shiftKey }, right, up) {
   else stage.orbit(TURN * right, -TURN * up);
 }
 
+function flip(part) {
+  view[part] = !view[part];
+  stage.ask();
+  keep();
+}
+
 /** Plot what is pointed at, or what is selected. */
 function plot() {
   const row = selected();
@@ -522,16 +528,8 @@ onKeys({
   j: () => step(1),
   k: () => step(-1),
   p: () => probes.hovered && pin(probes.hovered),
-  n: () => {
-    view.normals = !view.normals;
-    stage.ask();
-    keep();
-  },
-  h: () => {
-    view.names = !view.names;
-    stage.ask();
-    keep();
-  },
+  n: () => flip("normals"),
+  h: () => flip("names"),
   a: () => {
     view.scale = null;
     look();

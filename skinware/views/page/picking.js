@@ -25,7 +25,7 @@ export function pick(stage, sheets, x, y) {
           normal[3 * i + 2] * (eye.z - p[3 * i + 2]) <
         0;
       // Those seen from inside only where there is no other; then what is in front; a small taxel may be missed a bit.
-      const score = (away ? 1000 : 0) + depth / stage.far + Math.max(0, distance - size) / REACH;
+      const score = (away ? 1000 : 0) + depth / stage.camera.far + Math.max(0, distance - size) / REACH;
       if (score < bestScore) [best, bestScore] = [{ sheet, i }, score];
     }
   }

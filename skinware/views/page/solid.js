@@ -55,7 +55,7 @@ export class Solid {
   setSheets(sheets) {
     for (const cloud of this.#clouds) {
       this.scene.remove(...cloud.points);
-      cloud.dispose();
+      cloud.geometry.dispose();
     }
     this.#clouds = sheets.map((sheet) => new Cloud(sheet, this.discs));
     for (const cloud of this.#clouds) this.scene.add(...cloud.points);

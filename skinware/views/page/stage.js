@@ -211,10 +211,6 @@ export class Stage {
     this.look(zUp(new Vector3().setFromSpherical(eye)).add(this.controls.target), this.controls.target.clone());
   }
 
-  get far() {
-    return this.camera.far;
-  }
-
   /** Where the edges of the picture are, 1 m ahead of the eye; what is below it needs a strip of its own. */
   get picture() {
     const tall = FILLED * Math.tan((VIEW_ANGLE * Math.PI) / 360);

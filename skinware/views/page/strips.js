@@ -119,10 +119,9 @@ class Strip {
     else drawTimes(pen, what);
   }
 
-  /** Draw the lines. @returns {?object} what was drawn; null while there is no room. */
-  paint() {
+  draw(isWhole) {
     const { clientWidth: width, clientHeight: height } = this.canvas;
-    if (!width || !height) return null;
+    if (!width || !height) return;
     const ratio = Math.min(devicePixelRatio, 2);
     const [wide, tall] = [Math.round(width * ratio), Math.round(height * ratio)];
     if (this.canvas.width !== wide) this.canvas.width = wide;
@@ -131,13 +130,7 @@ class Strip {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     const what = this.#what({ width, height }, this.strips.theme);
     this.#paint(new CanvasPen(context), what);
-    return what;
-  }
-
-  /** Draw the lines, and what is written beside them. */
-  draw() {
-    const what = this.paint();
-    if (!what) return;
+    if (!isWhole) return;
     setPressed(this.spectrum, this.isSpectrum);
     this.#label(what);
   }
@@ -370,19 +363,13 @@ export class Strips {
     return Math.min(this.frozen_ns, Math.max(this.frozen_ns - 1e9 * (KEPT_S - this.#span_s), end_ns));
   }
 
-  /** Draw what is new in the lines, as often as their movement needs. */
-  follow() {
-    if (performance.now() - this.#drawn_ms < EVERY_MS) return;
-    this.#drawn_ms = performance.now();
-    for (const strip of this.#strips) strip.paint();
-  }
-
-  draw() {
-    if (!this.#strips.length) return;
+  /** @param {boolean} isWhole with the figures beside the lines; else the lines, as often as their movement needs. */
+  draw(isWhole = true) {
+    if (!this.#strips.length || (!isWhole && performance.now() - this.#drawn_ms < EVERY_MS)) return;
     this.#drawn_ms = performance.now();
     const missed = this.lines.missed ? `, ${this.lines.missed} samples missed` : "";
     setText(this.span, `${figure(this.#span_s)} s${missed}`);
-    for (const strip of this.#strips) strip.draw();
+    for (const strip of this.#strips) strip.draw(isWhole);
   }
 
   /** What is shown, for tests: lines, with their newest samples. */

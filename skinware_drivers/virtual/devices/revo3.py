@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 from msgspec import Meta
 
 from skinware_drivers.virtual import Device, ModbusEmulator, Places, SerialEmulatorOptions, on_a_grid, on_pads
@@ -28,6 +29,14 @@ _PRESSURE = {
     4700: 52,
 }
 """First register and number of taxels of each pad."""
+_ROWS = {
+    36: "12345 012345 012345 0345 0345 0345 035 045 5",
+    31: "0134 01345 012345 012345 012345 6 6 6 6",
+    57: 8 * "01234 " + "123 12" + 4 * " 567",
+    21: "123 123 1234 1234 1234 5 5 5",
+    52: "15 1234 1234 01234" + 5 * " 12345" + 4 * " 567",
+}
+"""Columns with taxels in each row of a pad of so many, by the maker's program."""
 _MATRIX = (53, 56, 22, 22, 27, 22, 27, 22, 27, 22, 27)
 _PACKED_AT = (5240, 5340, 5380, 5440, 5480, 5540, 5580, 5640, 5680, 5740, 5780)
 _VALUES = {"adc": 0, "raw": 1, "force": 2}
@@ -64,7 +73,12 @@ class EmulatedRevo3(ModbusEmulator[EmulatedRevo3Options]):
         super().__init__(options, **more)
 
     def places(self) -> Places:
-        return on_a_grid(42, 16) if self.options.sums else on_pads(*[(points, 6) for points in self._points])
+        if self.options.sums:
+            return on_a_grid(42, 16)
+        if self.options.mapping != "pressure" or not set(self._points) <= set(_ROWS):
+            return on_pads(*[(points, 6) for points in self._points])
+        rows = [(pad, *row) for pad, n in enumerate(self._points) for row in enumerate(_ROWS[n].split())]
+        return np.array([(int(column) / 16, row / 16, pad) for pad, row, columns in rows for column in columns])
 
     def registers(self, device: Device, values: Sequence[int]) -> Mapping[int, int]:
         """Return the registers of the data; those of no pad are 0."""

@@ -17,6 +17,8 @@ import numpy.typing as npt
 
 from skinware.errors import BusNotAvailable, ConfigurationError, MissingExtra
 from skinware.memory.namespace import Namespace
+from skinware_drivers.adapter import AnyAdapter
+from skinware_drivers.options import options_of
 from skinware_drivers.proving.captures import SnapshotLog
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
@@ -200,8 +202,7 @@ class _Devices:
         emulator: Any = load_emulator(driver)
         if not issubclass(emulator, Emulator):
             raise ConfigurationError(f"{driver}: these emulated devices have a touch of their own")
-        given = msgspec.convert(dict(options), emulator.Options, strict=False)
-        self.hardware = emulator(given, source=self._felt)
+        self.hardware = emulator(options_of(emulator, options), source=self._felt)
         self.numbers = list(self.hardware.numbers)
         n = len(self.hardware.places())
         self.rows = world.rows(self.numbers, n)
@@ -226,13 +227,16 @@ class _SteppedDriver:
     """A driver on emulated devices, in a thread, whose time passes only in :meth:`step`."""
 
     def __init__(self, driver: str, options: Mapping[str, Any], devices: _Devices, period_s: float) -> None:
+        kind = load_driver(driver)
+        adapter = kind(options_of(kind, options))
+        adapter.check()
         self._devices, self._period_s, self._clock = devices, period_s, HandClock()
         self._namespace = Namespace(f"stepped-{os.getpid()}-{secrets.token_hex(4)}")
         self._thread = ThreadPoolExecutor(1, "stepped driver")
         self._loop = HandLoop(self._clock)
         self._log = SnapshotLog(self._clock)
         self._log.keep = False
-        self._runner: Runner = self._now(lambda: self._make(driver, options))
+        self._runner: Runner = self._now(lambda: self._make(driver, adapter))
         self._task = self._loop.create_task(self._runner.run())
         try:
             self._begin()
@@ -259,10 +263,7 @@ class _SteppedDriver:
 
         return self._thread.submit(act).result()
 
-    def _make(self, driver: str, options: Mapping[str, Any]) -> Runner:
-        kind = load_driver(driver)
-        adapter = kind(msgspec.convert(dict(options), kind.Options, strict=False))
-        adapter.check()
+    def _make(self, driver: str, adapter: AnyAdapter) -> Runner:
         hardware, size = self._devices.hardware, adapter.payload_size
         bus = BUSES[adapter.medium](driver, payload_size=size, hardware=hardware, clock=self._clock)
         return Runner(driver, [(driver, adapter, bus)], name=driver, namespace=self._namespace)

@@ -77,6 +77,18 @@ def options_from_strings(
     return options_class(**values)
 
 
+def options_of(kind: Any, values: Mapping[str, Any]) -> Any:
+    """Return the options of a driver or an emulator, a class with ``Options``, made from values.
+
+    Raises:
+        ConfigurationError: an option is unknown, missing, or has a wrong value.
+    """
+    try:
+        return msgspec.convert(dict(values), kind.Options, strict=False)
+    except msgspec.ValidationError as error:
+        raise ConfigurationError(f"options of {kind.__name__}: {error}") from None
+
+
 class Options(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Base of options: a new object checks every field, which msgspec does not; with more checks, call ``super()``.
 

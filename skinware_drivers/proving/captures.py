@@ -15,7 +15,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 import skinware.recording
@@ -27,6 +26,7 @@ from skinware.realtime import NS_PER_S
 from skinware.recording import Recording
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Bus
+from skinware_drivers.options import options_of
 from skinware_drivers.proving.updates import Collected, Comparison, Decoding, compare, load
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
@@ -158,10 +158,7 @@ class _ReplayedWire:
         self.duration_ns: int = self._times[-1] - self._times[0] if self._times else 0
         self._stamps_ns, self._then_ns = array("q"), array("q")
         kind = next((one for one in (driver, *driver.elsewhere) if one.medium == medium), driver)
-        try:
-            adapter = kind(msgspec.convert(dict(options), kind.Options, strict=False))
-        except msgspec.ValidationError as error:
-            raise ConfigurationError(f"options of {kind.__name__}: {error}") from None
+        adapter = kind(options_of(kind, options))
         adapter.check()
         bus = replayed_bus(
             str(recording.path),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import os
 import runpy
 import subprocess
@@ -23,9 +24,14 @@ import gymnasium
 import mujoco
 from gymnasium.utils.env_checker import check_env
 
-from skinware.errors import BusNotAvailable, ConfigurationError, PlatformError
+from skinware.errors import BusNotAvailable, ConfigurationError, MissingExtra, PlatformError
 from skinware_drivers.learning import SkinEnv
+from skinware_drivers.loading import registered
+from skinware_drivers.registry import DRIVERS
+from skinware_drivers.virtual.hardware import load_emulator
 from skinware_drivers.virtual.physics.binding import find_binding
+
+from .scenes import on_the_pad
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "learning" / "grip.py"
 DOWN, RATE_HZ = -0.065, 50.0
@@ -97,6 +103,36 @@ def test_other_bodies_on_other_wires(world: str, driver: str, pose: str, taxels:
             assert np.array_equal(read["touch"], felt["touch"])
             most_n = max(most_n, info["force_n"].sum())
         assert most_n > 1
+
+
+OTHER_NUMBERS = ("canopen", "dev001", "papillarray", "paxini", "wuji_glove", "xela_server")
+PRESSED_DOWN, OWN_TOUCH = ("icub_eth", "tactile_glove"), ("roboskin",)
+"""Values of the former fall under a press, which no transfer makes; the latter has a touch of its own."""
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("driver", sorted({*registered(DRIVERS)} - {*PRESSED_DOWN, *OWN_TOUCH}))
+def test_each_driver_shows_what_its_devices_feel_or_is_refused(driver: str, tmp_path: Path) -> None:
+    emulator: Any = load_emulator(driver)
+    hardware = emulator(emulator.Options())
+    rows, counts = min(len(hardware.places()), 16), float(np.max(hardware.swing)) / 3
+    module = f"rows = {rows}\npitch_m = [0.001, 0.0015]\ndevice = {hardware.numbers[0]}"
+    world = on_the_pad(tmp_path, module, counts=counts)
+    if driver in OTHER_NUMBERS:
+        with pytest.raises(ConfigurationError, match="its devices feel"):
+            SkinEnv(world, driver, rate_hz=5, through_driver=True)
+        return
+    with (
+        closing(SkinEnv(world, driver, rate_hz=5)) as direct,
+        closing(SkinEnv(world, driver, rate_hz=5, through_driver=True)) as driven,
+    ):
+        felt, read = [direct.reset(seed=1)[0]["touch"]], [driven.reset(seed=1)[0]["touch"]]
+        for press in np.linspace(-1, 3, 8):
+            action = np.array([{"press": press}.get(name, 0) for name in direct.scene.actuators.names], np.float32)
+            felt.append(direct.step(action)[0]["touch"])
+            read.append(driven.step(action)[0]["touch"])
+    assert np.array_equal(read, felt)
+    assert np.ptp(felt, axis=0).max() > 0.3 * counts
 
 
 def test_a_seed_is_an_episode_bit_by_bit() -> None:
@@ -181,6 +217,8 @@ def test_faults_of_the_wire_are_seen() -> None:
     [
         ({"actuators": ["lifd"]}, "there is no actuator 'lifd'; there are lift, close"),
         ({"rate_hz": 1}, "rate_hz 1: give at least 2"),
+        ({"options": {"lose": 2}}, "options of EmulatedRobotiqTsf: .*lose"),
+        ({"through_driver": True, "driver_options": {"period": 2}}, "options of RobotiqTsfDriver: .*period"),
         ({"render_mode": "human"}, "render_mode 'human': give None or rgb_array"),
     ],
 )
@@ -196,6 +234,13 @@ def test_devices_that_do_not_fit() -> None:
         SkinEnv("mujoco:forearm", "roboskin")
     with pytest.raises(BusNotAvailable, match="robotiq_tsf: no values of all devices"):
         Cup(through_driver=True, options={"dead": [0, 1], "dead_after_s": 0})
+
+
+def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "skinware_drivers.learning")
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'skinware\[mujoco\]'"):
+        importlib.import_module("skinware_drivers.learning")
 
 
 def test_actions_that_are_none() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import os
 import secrets
 import shutil
@@ -238,6 +239,7 @@ class _SteppedDriver:
         self._log.keep = False
         self._runner: Runner = self._now(lambda: self._make(driver, adapter))
         self._task = self._loop.create_task(self._runner.run())
+        atexit.register(self.close)
         try:
             self._begin()
         except BaseException:
@@ -249,6 +251,7 @@ class _SteppedDriver:
         return self._now(self._step)
 
     def close(self) -> None:
+        atexit.unregister(self.close)
         self._now(self._end)
         self._thread.shutdown()
         self._loop.close()
@@ -261,7 +264,11 @@ class _SteppedDriver:
             with _ONE_TIME, package_on(self._clock):
                 return action()
 
-        return self._thread.submit(act).result()
+        try:
+            done = self._thread.submit(act)
+        except RuntimeError:  # Python ends, and has ended all pools of threads before
+            return act()
+        return done.result()
 
     def _make(self, driver: str, adapter: AnyAdapter) -> Runner:
         hardware, size = self._devices.hardware, adapter.payload_size

@@ -267,6 +267,22 @@ def test_a_machine_that_draws_nothing_says_so(monkeypatch: pytest.MonkeyPatch) -
         assert blind.render() is None
 
 
+FORGOTTEN = """
+from skinware_drivers.learning import SkinEnv
+env = SkinEnv("mujoco:gripper", "robotiq_tsf", through_driver=True)
+env.reset()
+print(env._wire._namespace.path)
+"""
+
+
+@pytest.mark.thorough
+def test_one_that_was_not_closed_leaves_nothing_behind() -> None:
+    run = subprocess.run([sys.executable, "-c", FORGOTTEN], capture_output=True, text=True, check=True)
+    assert run.stderr == ""
+    assert run.stdout.startswith("/dev/shm/")
+    assert not Path(run.stdout.strip()).exists()
+
+
 DRAWN = """
 from skinware.errors import PlatformError
 from skinware_drivers.learning import SkinEnv

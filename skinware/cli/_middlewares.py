@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import socket
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import click
 
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
     from skinware.conversion.live import Sink
     from skinware.ros2.transport import Node
     from skinware.yarp.names import NameServer
+
+log = logging.getLogger(__name__)
 
 
 @click.command(
@@ -251,8 +256,8 @@ def _show_port(event: dict[str, Any]) -> None:
 
 
 _RERUN, _FOXGLOVE_PORT = "rerun+http://127.0.0.1:9876/proxy", 8765
-_STOP_S, _BACKLOG = 1.0, 128
-"""How long the server's end is waited for, and the messages that wait for a slow client at most."""
+_STOP_S, _BACKLOG = 3.0, 128
+"""How long the end of a connection is waited for, and the messages that wait for a slow client at most."""
 
 _rate_option = click.option(
     "--rate",
@@ -292,11 +297,19 @@ def rerun(
     recording = rerun.RecordingStream("skinware")
     if file is None:
         recording.connect_grpc(connect)
+        place = urlsplit(connect)
+        try:
+            socket.create_connection((place.hostname or "", place.port or 0), _STOP_S).close()
+        except OSError as error:
+            why = error.strerror or error
+            log.warning("no viewer at %s yet (%s): start one, as with: rerun", connect, why)
     else:
         recording.save(file)
     _run(RerunSink(recording), names, rate_hz, namespace, as_json, connect if file is None else str(file))
-    recording.flush()
-    recording.disconnect()
+    if file is None:
+        _end(recording.disconnect)
+    else:
+        recording.disconnect()
 
 
 @click.command(
@@ -333,9 +346,16 @@ def foxglove(
     try:
         _run(FoxgloveSink(context), names, rate_hz, namespace, as_json, where)
     finally:
-        stopping = Thread(target=server.stop, daemon=True)  # it waits for every client that has said nothing yet
-        stopping.start()
-        stopping.join(_STOP_S)
+        _end(server.stop)
+
+
+def _end(stop: Callable[[], object]) -> None:
+    """End a connection, or the program without it: other ends that say nothing are waited for without end."""
+    ending = Thread(target=stop, daemon=True)
+    ending.start()
+    ending.join(_STOP_S)
+    if ending.is_alive():
+        os._exit(cli.EXIT_DONE)
 
 
 def _run(sink: Sink, names: tuple[str, ...], rate_hz: float, namespace: str | None, as_json: bool, where: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import socket
 from pathlib import Path
@@ -23,7 +24,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, publishing
 from tests.commands import PATIENCE_S, running
-from tests.streams.peers import LOCAL
+from tests.streams.peers import LOCAL, free_port
 from tests.views.test_scene import a_hand
 
 PROTOCOL, MESSAGE, HEAD = Subprotocol("foxglove.sdk.v1"), 1, 13
@@ -53,6 +54,19 @@ def test_rerun_has_places_values_and_states(tmp_path: Path) -> None:
     assert all(np.allclose(row, expected) for row in values)
     assert statuses == [[0] * len(expected)] * len(values)
     assert len({tuple(row) for row in found["Points3D:colors"]}) == 1
+
+
+@pytest.mark.parametrize("is_there", [False, True], ids=["nobody", "silent"])
+def test_rerun_ends_without_a_viewer(is_there: bool) -> None:
+    with publishing(torso()), contextlib.ExitStack() as stack:
+        port = free_port()
+        if is_there:
+            stack.enter_context(socket.create_server((LOCAL, port)))
+        url = f"rerun+http://{LOCAL}:{port}/proxy"
+        bridge = stack.enter_context(running("skin-bridge", "rerun", "--connect", url))
+        bridge.wait_for("ready")
+        bridge.stop()
+    assert (f"skin-bridge: no viewer at {url} yet (Connection refused): start one" in bridge.errors) is not is_there
 
 
 def test_a_namespace_that_may_not_be_read_is_said_once(

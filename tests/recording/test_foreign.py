@@ -27,7 +27,7 @@ from skinware.cli._command import exit_status
 from skinware.cli.convert import command as skin_convert
 from skinware.conversion import convert_foreign
 from skinware.conversion.foreign import guess, open_source
-from skinware.conversion.foreign.source import whole
+from skinware.conversion.foreign.source import BLOCK_BYTES, whole
 from skinware.errors import ConfigurationError
 from skinware.recording import Series
 from skinware.status import Status
@@ -190,6 +190,14 @@ def test_parquet(tmp_path: Path) -> None:
     for number, first in enumerate(range(0, N, 100)):
         pa.parquet.write_table(table.slice(first, 100), folder / f"{number}.parquet")
     require(only(folder), np.concatenate([values, matrix.reshape(N, 12)], axis=1))
+
+
+def test_pictures_in_parquet_are_read_a_few_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "camera.parquet"
+    pictures = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(100 * 50_000, np.float32)), 50_000)
+    pa.parquet.write_table(pa.table({"time": TIMES[:100], "picture": pictures}), path, compression="zstd")
+    with contextlib.closing(open_source(path)) as source:
+        assert all(rows["picture"].nbytes <= BLOCK_BYTES for rows in source.blocks("", ["picture"]))
 
 
 def test_a_parquet_page_that_does_not_fit_its_checksum(tmp_path: Path) -> None:

@@ -133,12 +133,14 @@ class ParquetSource(ColumnSource):
         with self._opened(self._paths[0]) as file:
             with blamed(lambda reason: f"{path}: damaged ({reason}): write it again"):
                 kinds = {field.name: str(field.type) for field in file.schema_arrow}
-                batches = list(islice(file.iter_batches(_BATCH_ROWS), 1))
+                row_bytes = max((row.nbytes for row in islice(file.iter_batches(1), 1)), default=0)
+                self._batch_rows = max(1, min(_BATCH_ROWS, BLOCK_BYTES // max(1, row_bytes)))
+                batches = list(islice(file.iter_batches(self._batch_rows), 1))
         shapes: dict[str, tuple[int, ...]] = {}
         for batch, name in product(batches, kinds):
             with contextlib.suppress(ConfigurationError, KeyError):  # or two columns of one name
                 found = self._array(self._paths[0], name, batch.column(name))
-                if found.dtype.kind != "U":
+                if found.dtype.kind != "U" and prod(found.shape[1:]) <= _MOST_NUMBERS:
                     shapes[name] = found.shape[1:]
         self.tables = {"": shapes}
         self.left_out = {name: kind for name, kind in kinds.items() if name not in shapes}
@@ -148,7 +150,7 @@ class ParquetSource(ColumnSource):
         for path in self._paths:
             with self._opened(path) as file:
                 with blamed(lambda reason: f"{path}: damaged after row {done} ({reason}): write it again"):  # noqa: B023
-                    for batch in file.iter_batches(_BATCH_ROWS, columns=list(names)):
+                    for batch in file.iter_batches(self._batch_rows, columns=list(names)):
                         done += len(batch)
                         self.share = done / self._rows
                         yield {name: self._array(path, name, batch.column(name)) for name in names}

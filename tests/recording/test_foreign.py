@@ -409,6 +409,7 @@ MISTAKES = [
     damaged("bin.csv", lambda path: path.write_bytes(b"time,a\n0,\x001\n"), "bin.csv, byte 9: not a text"),
     damaged("latin.csv", lambda path: path.write_bytes(b"time,taxel_0\n0,1\n1,\xe9\n"), "latin.csv, byte 19: no UTF-8"),
     damaged("text.csv", later("1000,x\n"), "text.csv, line 1002: 'x' is no number"),
+    damaged("place.csv", later("1000,1_0\n"), "place.csv, line 1002: '1_0' is no number"),
     damaged("few.csv", later("1000\n"), "few.csv, line 1002: 1 cells instead of 2"),
     damaged("many.csv", later("1000,1,2\n"), "many.csv, line 1002: 3 cells instead of 2"),
     damaged("back.csv", later("5,1\n"), "back.csv, row 1001: time goes back by 994 s"),

@@ -208,6 +208,6 @@ def _are_numbers(line: str) -> list[bool]:
 def _number(cell: str) -> float | None:
     """Return a number, NaN for an empty cell, None for anything else."""
     try:
-        return float(cell)
+        return None if "_" in cell else float(cell)
     except ValueError:
         return np.nan if cell.strip().lower() in _MISSING else None

@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, BusReason, BusState, PatchState, Status, Why, is_fresh
+from skinware.status import (
+    LOAD_FILTERED,
+    LOAD_UNKNOWN,
+    BusReason,
+    BusState,
+    PatchState,
+    Status,
+    Why,
+    are_young,
+    is_fresh,
+)
 from skinware.text import NOT_FRESH, state_shown
 
 if TYPE_CHECKING:
@@ -239,10 +249,13 @@ def status_now(life: str, frame: DriverSnapshot, at_ns: int | None = None) -> np
     status, stale = frame.status, np.uint8(Status.STALE)
     if life in WITHOUT_NEWS:
         return status | stale
+    at_ns = now_ns() if at_ns is None else at_ns
+    if not frame.stale and are_young(frame.group_time_ns, at_ns):
+        return status
     fresh = is_fresh(
         status,
         frame.sensor_time_ns,
-        at_ns=now_ns() if at_ns is None else at_ns,
+        at_ns=at_ns,
         max_age_ns=frame.structure.age_limits_ns(frame.period_ns),
         alive=not frame.stale,
     )

@@ -56,6 +56,11 @@ def is_fresh(
     return fresh
 
 
+def are_young(time_ns: npt.NDArray[np.int64], at_ns: int) -> bool:
+    """Return whether data of all (n,) times is so recent at a moment that it is fresh, whatever its period."""
+    return bool(at_ns - _LEAST_NS <= time_ns.min(initial=at_ns) and time_ns.max(initial=0) <= at_ns + AHEAD_NS)
+
+
 class Status(enum.IntFlag):
     """Bits of a sensor's status; 0: no problem was known when the sample was published."""
 

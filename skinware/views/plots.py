@@ -249,8 +249,11 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot]
         found = np.full(len(lines), np.nan)
         if not some:
             return found
-        values = frame.values[at] * scale + offset
+        values: Values = frame.values[at] * scale + offset
         unknown = np.isnan(values) | ((frame.status[at] & _NO_VALUE) != 0)
+        if len(some) == len(at) == len(lines):  # a sensor each
+            values[unknown] = np.nan
+            return values
         values[unknown] = 0
         of_lines = np.where(highest, np.maximum.reduceat(values, starts), np.add.reduceat(values, starts))
         of_lines[np.logical_and.reduceat(unknown, starts)] = np.nan

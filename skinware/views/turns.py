@@ -231,12 +231,10 @@ class Viewer:
     def _contacts(self, driver: ShownDriver, quantity: Quantity, newest: Newest) -> list[dict[str, Any]]:
         seen = newest.contacts_position, quantity.name, self._edition
         if self._touches.get(driver.number, (None, []))[0] != seen:
-            self._touches[driver.number] = seen, self._contacts_in(driver, quantity, newest.contacts)
+            self._touches[driver.number] = seen, self._touched(driver, quantity, newest.contacts)
         return self._touches[driver.number][1]
 
-    def _contacts_in(
-        self, driver: ShownDriver, quantity: Quantity, frame: ContactsSample | None
-    ) -> list[dict[str, Any]]:
+    def _touched(self, driver: ShownDriver, quantity: Quantity, frame: ContactsSample | None) -> list[dict[str, Any]]:
         if frame is None or frame.source.type_name != quantity.type.name:
             return []
         laid_out = self._follower.scene.of(driver.name, quantity.name).position

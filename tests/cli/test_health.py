@@ -53,8 +53,9 @@ def test_what_became_too_old_since_is_stale(monkeypatch: pytest.MonkeyPatch) -> 
         skin.publish()
         frame = reader.read()
         assert status_now("live", frame).tolist() == [0] * 3 + [Status.OUT_OF_RANGE] + [0] * 8
-        monkeypatch.setattr(Structure, "age_limits_ns", lambda self, _: np.zeros(self.n_sensors, np.int64))
-        assert status_now("live", frame).tolist() == [Status.STALE] * 3 + [Status.OUT_OF_RANGE] + [Status.STALE] * 8
+        monkeypatch.setattr(Structure, "age_limits_ns", lambda self, _: np.full(self.n_sensors, SECOND))
+        later = status_now("live", frame, frame.published_ns + 2 * SECOND)
+        assert later.tolist() == [Status.STALE] * 3 + [Status.OUT_OF_RANGE] + [Status.STALE] * 8
 
 
 @pytest.mark.usefixtures("frozen_clock")

@@ -156,7 +156,7 @@ class TextSource(ColumnSource):
                 if name in self._dates:
                     found.append(int(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64)))
                 else:
-                    found.append(np.int64(int(cell)))
+                    found.append(int(np.int64(int(cell))))
             except (ValueError, OverflowError):
                 self._damaged(line, f"{cell[:_SHOWN]!r} in {name} is neither a date nor an integer of 64 bits")
         return np.array(found, np.int64)

@@ -32,6 +32,8 @@ PAGE = Path(__file__).parent / "page"
 """The files that the browser runs."""
 
 _TICK_S = 0.01
+_LONGEST_S = 0.04
+"""Between two looks while there is news: plots want every snapshot, and the ring of a fast driver holds 64 of them."""
 _LONGEST_TURN_S = 0.5
 _MOST_VIEWERS = 32
 _MOST_MARKS = 64
@@ -134,7 +136,7 @@ class ViewServer:
                 viewer.look.follow(driver)
             viewer.plots.take()
         show.follow()
-        return max(period_s, _TICK_S) if newer else _TICK_S
+        return min(max(period_s, _TICK_S), _LONGEST_S) if newer else _TICK_S
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         try:

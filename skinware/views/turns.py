@@ -7,6 +7,7 @@ bytes from the first one.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import Any
 
 import msgspec
@@ -51,6 +52,15 @@ class Blobs:
         return b"".join([len(text).to_bytes(4, "little"), text, *self._parts])
 
 
+class _Got:
+    """What a viewer has got of one driver: its newest change, statuses by type, and contacts with what they are of."""
+
+    def __init__(self) -> None:
+        self.change: tuple[int, int] | None = None
+        self.status: dict[str, npt.NDArray[np.uint8]] = {}
+        self.contacts: tuple[tuple[object, ...], list[dict[str, Any]]] = (), []
+
+
 class Viewer:
     """One viewer of a show: its look, its questions, and what it has got so far."""
 
@@ -60,9 +70,7 @@ class Viewer:
         self._sent: dict[str, Any] = {}  # of the replays
         self._number = 0
         self._edition = -1
-        self._changes: dict[int, tuple[int, int]] = {}
-        self._status: dict[tuple[int, str], npt.NDArray[np.uint8]] = {}
-        self._touches: dict[int, tuple[tuple[object, ...], list[dict[str, Any]]]] = {}
+        self._got: defaultdict[int, _Got] = defaultdict(_Got)  # by the driver's number
         self._state_due_ns = 0
         self._lives: list[str] = []
         self._exact: list[tuple[int, int]] = []
@@ -109,7 +117,7 @@ class Viewer:
             or self._error is not None
             or self._edition != self._follower.edition
             or self._sent != self._of_replays()
-            or any(self._changes.get(driver.number) != _seen(driver) for driver in self._follower.drivers)
+            or any(self._got[driver.number].change != _seen(driver) for driver in self._follower.drivers)
         )
 
     def turn(self, besides: dict[str, Any]) -> bytes:
@@ -127,8 +135,8 @@ class Viewer:
             self._see_all_again()
         pictures = []
         for driver in self._follower.drivers:
-            if self._changes.get(driver.number) != _seen(driver):
-                self._changes[driver.number] = _seen(driver)
+            if self._got[driver.number].change != _seen(driver):
+                self._got[driver.number].change = _seen(driver)
                 shown = self._picture(driver, blobs)
                 pictures += [shown] if shown is not None else []
         if pictures:
@@ -167,7 +175,7 @@ class Viewer:
         return {"replays": self.show.replays, "outlines": self.show.outlines}
 
     def _see_all_again(self) -> None:
-        self._changes, self._status = {}, {}
+        self._got.clear()
 
     def _skin(self, blobs: Blobs) -> dict[str, Any]:
         follower, scene = self._follower, self._follower.scene
@@ -221,18 +229,18 @@ class Viewer:
             shown["totals"] = blobs.add(picture.totals[-1], "<f4")
             if len(picture.totals) > 1:
                 shown["between"] = blobs.add(picture.totals[:-1], "<f4")
-        status, key = newest.marked[quantity.where], (driver.number, quantity.name)
-        before = self._status.get(key)
+        status, got = newest.marked[quantity.where], self._got[driver.number]
+        before = got.status.get(quantity.name)
         if before is None or not np.array_equal(status, before):
-            self._status[key] = status
+            got.status[quantity.name] = status
             shown["status"] = blobs.add(status, "u1")
         return shown
 
     def _contacts(self, driver: ShownDriver, quantity: Quantity, newest: Newest) -> list[dict[str, Any]]:
-        seen = newest.contacts_position, quantity.name, self._edition
-        if self._touches.get(driver.number, (None, []))[0] != seen:
-            self._touches[driver.number] = seen, self._touched(driver, quantity, newest.contacts)
-        return self._touches[driver.number][1]
+        got, seen = self._got[driver.number], (newest.contacts_position, quantity.name, self._edition)
+        if got.contacts[0] != seen:
+            got.contacts = seen, self._touched(driver, quantity, newest.contacts)
+        return got.contacts[1]
 
     def _touched(self, driver: ShownDriver, quantity: Quantity, frame: ContactsSample | None) -> list[dict[str, Any]]:
         if frame is None or frame.source.type_name != quantity.type.name:

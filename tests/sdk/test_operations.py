@@ -15,8 +15,9 @@ from skinware.realtime import now_ns
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link
+from skinware_drivers.loading import registered
 from skinware_drivers.operations import operation, operations_of
-from skinware_drivers.registry import DRIVERS, load_driver, registered
+from skinware_drivers.registry import DRIVERS, load_driver
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until

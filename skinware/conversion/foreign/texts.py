@@ -149,12 +149,13 @@ class TextSource(ColumnSource):
         return np.array(rows, np.float64).reshape(-1, len(places))
 
     def _whole_numbers(self, lines: list[str], first: int, name: str) -> npt.NDArray[np.int64]:
-        (place,), found = self._places[name], []
+        (place,) = self._places[name]
+        found: list[np.int64] = []
         for line, cells in self._split(lines, first):
             cell = cells[place].strip()
             try:
                 if name in self._dates:
-                    found.append(int(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64)))
+                    found.append(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64))
                 else:
                     found.append(int(np.int64(int(cell))))
             except (ValueError, OverflowError):

@@ -421,6 +421,8 @@ MISTAKES = [
     damaged("line.csv", later("9" * (1 << 20)), "line.csv: a line of 1048576 bytes or more: not a text of numbers"),
     damaged("time.csv", lambda path: path.write_text(f"time,taxel_0\n{10**30},1\n{10**31},2\n"),
             "in time is neither a date nor an integer of 64 bits"),
+    damaged("date.csv", lambda path: path.write_text("time,taxel_0\n2600-01-01 00:00:00,1\n2600-01-01 00:00:01,2\n"),
+            "line 2: '2600-01-01 00:00:00' in time is neither a date"),
     damaged("digits.csv", lambda path: path.write_text(f"time,taxel_0\n{'9' * 5000},1\n1,2\n"), "is neither a date"),
     damaged("bare.npz", lambda path: zipped(path, "time", np.lib.format.magic(1, 0)), "bare.npz: not an NPZ file"),
     damaged("deep.npz", lambda path: zipped(path, "time.npy", np.lib.format.magic(1, 0) + b"\xe8\x03" + b"(" * 1000),

@@ -155,9 +155,12 @@ class TextSource(ColumnSource):
             cell = cells[place].strip()
             try:
                 if name in self._dates:
-                    found.append(np.datetime64(cell.removesuffix("Z"), "ns").astype(np.int64))
+                    date = np.datetime64(cell.removesuffix("Z"), "ns")  # which wraps
+                    if not str(date).startswith(cell[:4]):
+                        raise ValueError
+                    found.append(date.astype(np.int64))
                 else:
-                    found.append(int(np.int64(int(cell))))
+                    found.append(np.int64(int(cell)))
             except (ValueError, OverflowError):
                 self._damaged(line, f"{cell[:_SHOWN]!r} in {name} is neither a date nor an integer of 64 bits")
         return np.array(found, np.int64)

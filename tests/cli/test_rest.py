@@ -69,7 +69,7 @@ def test_only_fresh_values_count() -> None:
     watching.see(90, 2, fresh=stale)
     assert np.isnan(watching.rest.baseline[:5]).all()
     assert (watching.rest.change(np.full(N, 90, np.float32)) < 1).all()
-    watching.see(20)
+    watching.see(20, 0.1)  # at rest, ten snapshots a second count
     assert watching.rest.baseline[:5].tolist() == [20] * 5
     watching.see(np.nan)
     assert np.isfinite(watching.rest.baseline).all()

@@ -211,7 +211,7 @@ def test_a_framing_that_only_python_knows_stays_in_python() -> None:
         DriverReader("fingertip") as reader,
     ):
         before = bus.received
-        assert value_is(reader, 10).data_path == DataPath.NATIVE
+        assert value_is(reader, 10).data_path == DataPath.PYTHON
         device.write(frames)
         wait_until(lambda: bus.counters.frames == 3)
         assert bus.received > before

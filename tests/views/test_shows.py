@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 import urllib.request
@@ -62,7 +63,7 @@ def playing(serving: Serve, *names: str, files: RecordingFiles) -> Iterator[Page
 
 
 def namespaces() -> list[Path]:
-    return list(ROOT.glob("skinware.view-*"))
+    return list(ROOT.glob(f"skinware.view-{os.getpid()}-*"))
 
 
 def problems(page: Page) -> list[str]:

@@ -20,13 +20,13 @@ from skinware.errors import BusNotAvailable, ConfigurationError, MissingExtra
 from skinware.memory.namespace import Namespace
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.options import options_of
-from skinware_drivers.proving.captures import SnapshotLog
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.virtual.bus import BUSES
 from skinware_drivers.virtual.emulator import Emulator, each_value
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, package_on
 from skinware_drivers.virtual.hardware import load_emulator
+from skinware_drivers.virtual.snapshot_log import SnapshotLog
 
 try:
     import gymnasium

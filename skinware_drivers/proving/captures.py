@@ -18,9 +18,7 @@ from typing import Any
 import numpy as np
 
 import skinware.recording
-from skinware.driver_service import DriverReader
-from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import ConfigurationError, ServiceTimeout, StructureChanged
+from skinware.errors import ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
 from skinware.recording import Recording
@@ -33,6 +31,7 @@ from skinware_drivers.running.runner import Runner
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, package_on
 from skinware_drivers.virtual.logs import WireSource
 from skinware_drivers.virtual.recorded import medium_of, replayed_bus, wire_of
+from skinware_drivers.virtual.snapshot_log import SnapshotLog
 
 _NAME = "captured"
 _SLOTS = 64
@@ -186,48 +185,6 @@ class _ReplayedWire:
         at = np.maximum(np.searchsorted(stamps_ns, time_ns, side="right") - 1, 0)
         later_ns = stamps_ns[at] - np.frombuffer(self._then_ns, np.int64)[at]
         return np.where(time_ns == 0, 0, time_ns - later_ns)
-
-
-class SnapshotLog:
-    """Read every snapshot that a driver publishes, in order, as a user's program does.
-
-    Attributes:
-        keep: keep all snapshots; False: only the newest.
-    """
-
-    def __init__(self, clock: HandClock) -> None:
-        self.frames: list[DriverSnapshot] = []
-        self.times_ns: list[int] = []
-        self.keep = True
-        self.count: int = 0
-        self.reader: DriverReader | None = None
-        self._clock = clock
-
-    def look(self, runner: Runner) -> None:
-        if self.reader is None:
-            if runner.builder.writer is None or runner.builder.writer.closed:
-                return
-            self.reader = DriverReader(runner.identity.name, namespace=runner.identity.namespace)
-        last = self.frames[-1].position if self.frames else None
-        while self.reader.refresh() not in (None, last):
-            try:
-                frame = next(self.reader.in_order(timeout_s=0))
-            except ServiceTimeout:
-                return
-            except StructureChanged:
-                self.reader.reattach()
-                continue
-            last = frame.position
-            if not self.keep:
-                self.frames.clear()
-                self.times_ns.clear()
-            self.count += 1
-            self.frames.append(frame)
-            self.times_ns.append(self._clock.now_ns)
-
-    def close(self) -> None:
-        if self.reader is not None:
-            self.reader.close()
 
 
 async def _run(

@@ -20,7 +20,6 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
-from skinware_drivers.proving.captures import SnapshotLog
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.waiting import defect, require, run_in_its_time
@@ -32,6 +31,7 @@ from skinware_drivers.testing.wire import (
 )
 from skinware_drivers.virtual.emulator import each_value
 from skinware_drivers.virtual.hand_clock import HandClock
+from skinware_drivers.virtual.snapshot_log import SnapshotLog
 
 T = TypeVar("T")
 NAME = "driver_under_test"

@@ -161,3 +161,14 @@ def pytest_in(folder: Path, *arguments: str) -> str:
     command = [sys.executable, "-m", "pytest", "-c", "/dev/null", "--rootdir", str(folder), *plugin, *arguments]
     done = subprocess.run([*command, str(folder)], capture_output=True, text=True, cwd=folder, timeout=100)
     return done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("module", ["testing.conformance", "testing.driving", "testing.plugin", "learning"])
+def test_no_packages_for_recordings_are_needed(module: str) -> None:
+    """A driver of somebody else is tested with the extra ``testing`` alone."""
+    if module == "learning":
+        pytest.importorskip("gymnasium", reason="needs the extra mujoco")
+        pytest.importorskip("mujoco", reason="needs the extra mujoco")
+    code = f"import sys; sys.modules |= dict.fromkeys(['mcap', 'zstandard'])\nimport skinware_drivers.{module}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -53,7 +53,7 @@ class Blobs:
 
 
 class _Got:
-    """What a viewer has got of one driver: its newest change, statuses by type, and contacts with what they are of."""
+    """One driver as a viewer has it: its newest change, statuses by type, and contacts with their source."""
 
     def __init__(self) -> None:
         self.change: tuple[int, int] | None = None

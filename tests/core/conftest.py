@@ -16,9 +16,9 @@ from tests.specification.ring import use_specification
 
 
 @pytest.fixture(scope="module")
-def process_server() -> Iterator[None]:
+def process_server(request: pytest.FixtureRequest) -> Iterator[None]:
     """Child processes start quickly while it runs."""
-    with workers.process_server():
+    with workers.process_server(request.module.__name__):
         yield
 
 

@@ -41,9 +41,12 @@ def seeded(request: pytest.FixtureRequest) -> random.Random:
 
 
 @contextlib.contextmanager
-def process_server() -> Iterator[None]:
-    """Children are forked from a small process that has imported everything; it ends with the tests of a module."""
-    PROCESSES.set_forkserver_preload(["tests.core.workers", "skinware.driver_service"])
+def process_server(module: str) -> Iterator[None]:
+    """Children are forked from a small process that has imported everything, this module of tests, too.
+
+    It ends with the tests of the module.
+    """
+    PROCESSES.set_forkserver_preload(["tests.core.workers", "skinware.driver_service", module])
     try:
         yield
     finally:

@@ -203,8 +203,13 @@ def test_a_bad_line_and_a_restart(emulated_skin: Callable[..., EmulatedSkin], dr
     devices = restarted_on_demand(emulator)
     skin = emulated_skin(driver, devices, boot_s=0.6, **faults)
     read_until(skin.reader, is_fresh)
-    devices.restart_now = True
-    read_until(skin.reader, lambda frame: PatchState.STALE in frame.patch_state)
+
+    def falls_silent(frame: DriverSnapshot) -> bool:
+        devices.restart_now = True  # without power until it is noticed: a driver that is held up excuses a moment
+        return PatchState.STALE in frame.patch_state
+
+    read_until(skin.reader, falls_silent)
+    devices.restart_now = False
     read_until(skin.reader, lambda frame: bool((frame.patch_state == PatchState.LIVE).all()) and is_fresh(frame))
 
 

@@ -227,7 +227,8 @@ def test_mistakes(more: dict[str, Any], reason: str) -> None:
         SkinEnv("mujoco:gripper", "robotiq_tsf", **more)
 
 
-def test_devices_that_do_not_fit() -> None:
+def test_devices_that_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skinware_drivers.learning._LONGEST_START_S", 2.0)
     with pytest.raises(ConfigurationError, match="the driver has 96 sensors, its devices feel 93"):
         SkinEnv("mujoco:hand", "paxini", through_driver=True)
     with pytest.raises(ConfigurationError, match="roboskin: these emulated devices have a touch of their own"):

@@ -179,11 +179,9 @@ class SkinEnv(gymnasium.Env[Observation, Action]):
         touch, fresh = self._devices.feel(self.world, self._count * self._period_ns), True
         if self._wire is not None:
             touch, fresh = self._wire.step()
-        touches = self.scene.touching()
-        modules, newtons = [one.module for one in touches], [one.normal_n for one in touches]
         info = {
-            "force_n": np.bincount(modules, newtons, len(self.scene.modules)).astype(np.float64),
-            "slip_m_s": max((one.slip_m_s for one in touches), default=0.0),
+            "force_n": self.scene.pressed_n(),
+            "slip_m_s": max((touch.slip_m_s for touch in self.scene.touching()), default=0.0),
             "fresh": fresh,
         }
         position = self.scene.data.actuator_length[self._actuators]

@@ -56,7 +56,7 @@ def test_rerun_has_places_values_and_states(tmp_path: Path) -> None:
     assert len({tuple(row) for row in found["Points3D:colors"]}) == 1
 
 
-@pytest.mark.parametrize("is_there", [False, True], ids=["nobody", "silent"])
+@pytest.mark.parametrize("is_there", [False, True], ids=["no viewer", "silent"])
 def test_rerun_ends_without_a_viewer(is_there: bool) -> None:
     with publishing(torso()), contextlib.ExitStack() as stack:
         port = free_port()

@@ -188,7 +188,7 @@ def listed_ms(load: float) -> list[int]:
 
 
 def test_values_within_their_uncertainty_are_a_contact_only_if_they_last() -> None:
-    """What flickers as a touch ends is none; a faint load that is held is one."""
+    """A load that flickers as a touch ends is no contact; a faint load that is held is one."""
     assert min(listed_ms(8.0)) == 40
     assert min(listed_ms(7.9)) == 320
 

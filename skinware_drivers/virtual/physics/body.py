@@ -131,6 +131,12 @@ class PhysicsScene:
             self._touching = self._touches(numbers, sides) if len(numbers) else []
         return self._touching
 
+    def pressed_n(self) -> ArrayF:
+        """Return (modules,) the normal force on each module in the newest step, N."""
+        touches = self.touching()
+        modules, forces = [touch.module for touch in touches], [touch.normal_n for touch in touches]
+        return np.bincount(modules, forces, len(self.modules)).astype(np.float64)
+
     def newtons(self) -> list[ArrayF]:
         """Return (n, 3) the forces on each module's taxels in the newest step: shear along x and y, and normal, N.
 

@@ -116,8 +116,7 @@ class WorldServices:
         scene = self._scene
         touches = scene.touching()
         columns = self._truth.begin(from_last=True)
-        modules, newtons = [touch.module for touch in touches], [touch.normal_n for touch in touches]
-        columns["module_n"][:] = np.bincount(modules, newtons, len(scene.modules))
+        columns["module_n"][:] = scene.pressed_n()
         columns["force_n"][0] = columns["module_n"].sum()
         for name in ("point_m", "normal_n", "shear_n", "slip_m_s", "module") if touches else ():
             columns[name][: len(touches)] = [getattr(touch, name) for touch in touches[:_MOST]]

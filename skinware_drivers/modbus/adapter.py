@@ -45,7 +45,8 @@ _UNHURRIED = 1.25
 _LISTEN_S, _PERIODS, _LONGEST_LISTEN_S = 0.3, 4, 2.0
 _SILENT_S, _SLOWEST_CYCLE_S = 1.0, 10.0
 """A device that sends nothing for so long is silent; longest cycle that is measured."""
-_ENOUGH_CYCLES, _TOO_SLOW = 4, 1.5
+_ENOUGH_CYCLES, _TOO_SLOW = 4, 1.1
+"""A cycle that takes so many periods is too long: counts in a third of a second are exact to a tenth."""
 
 
 class ModbusException(BusError):

@@ -296,7 +296,7 @@ def test_a_matrix_that_shows_something_at_last_is_believed_from_then_on() -> Non
         assert not frame.module_untouched[0]
 
 
-@pytest.mark.parametrize(("cycle_s", "period_s"), [(2.7, 3.4), (0.7, 0.9), (0.02, 0.02), (0.0, 0.02)])
+@pytest.mark.parametrize(("cycle_s", "period_s"), [(2.7, 3.4), (0.7, 0.9), (0.026, 0.0325), (0.02, 0.02), (0.0, 0.02)])
 def test_the_period_follows_how_long_a_cycle_takes(cycle_s: float, period_s: float) -> None:
     class Listening:
         bus_name, log = "a bus", logging.getLogger("skinware.driver")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from skinware.learning import RecordedWindows, StreamedSamples, torch_dataset, t
 from tests.cli.fake_skin import fake_structure
 from tests.recording.test_learning_set import physical, status_of, table_of, write
 
+_PAGE = Path(__file__).parents[2] / "docs/how-to/learning.md"
+_SNIPPET = re.compile(r"^```py\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 STRUCTURE = fake_structure(1, 2, dtype="<u2")
 
 
@@ -85,6 +88,8 @@ def test_tensors_share_the_memory_of_arrays(tmp_path: Path) -> None:
         with pytest.raises(MissingExtra, match="pip install 'torch'"):
             torch_iterable(stream)
         return
+    (snippet,) = [each for each in _SNIPPET.findall(_PAGE.read_text()) if "torch_dataset" in each]
+    exec(snippet, {"torch": torch, "windows": windows})
     dataset = torch_dataset(windows)
     assert isinstance(dataset, torch.utils.data.Dataset)
     assert dataset[3]["values"].data_ptr() == windows[3]["values"].ctypes.data

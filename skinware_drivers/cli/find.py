@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from skinware_drivers.finding.ports import SerialPort
     from skinware_drivers.finding.running import RunningDriver
 
-_DETECTION_S = 10.0
 _WIDTH = 80
 """Columns of the text for people."""
 _MOST_CLASSES = 6
@@ -27,7 +26,7 @@ _MOST_CLASSES = 6
 
 @cli.command(
     "skin-find",
-    "skin-find                     CAN interfaces, adapters, serial ports",
+    "skin-find                     CAN interfaces, serial ports",
     "skin-find can0 --probe        ask which devices are on can0",
     "skin-find dds://0             topics of DDS, and which driver reads them",
     "skin-find --udev              fixed names for the serial ports",
@@ -89,9 +88,7 @@ async def look(
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import (
         NO_INTERFACE,
-        Detection,
         can_interfaces,
-        detect_adapters,
         kernel_has_can,
     )
     from skinware_drivers.finding.looking import listen, topics_on
@@ -107,16 +104,12 @@ async def look(
     buses_to_hear = [one.name for one in interfaces if one.up]
     buses_to_hear += [name for name in others if not BusName.of(name).is_only_asked]
 
-    async def search() -> Any:
-        return Detection() if buses else await asyncio.to_thread(detect_adapters, _DETECTION_S)
-
     topics = {
         name: await asyncio.to_thread(topics_on, name, listen_s, known_drivers("serial", driver_names))
         for name in networks
         if BusName.of(name).interface in ("dds", "ros2")
     }
-    detection: Detection
-    detection, *listened = await asyncio.gather(search(), *(listen(name, listen_s, drivers) for name in buses_to_hear))
+    listened = await asyncio.gather(*(listen(name, listen_s, drivers) for name in buses_to_hear))
     heard: dict[str, HeardOnBus] = {one.bus: one for one in listened}
     problems = [one.problem for one in listened if one.problem]
     if buses and problems:
@@ -139,8 +132,6 @@ async def look(
             ],
         },
         "buses": [on_bus(name) | ({"topics": topics[name]} if name in topics else {}) for name in others],
-        "adapters": detection.found,
-        "adapters_problem": detection.problem,
         "ports": [
             {
                 **msgspec.to_builtins(port),
@@ -240,18 +231,12 @@ def as_text(found: dict[str, Any]) -> list[str]:
         lines += _advice(can["advice"])
     for bus in found["buses"]:
         lines += ["", style(bus["bus"], underline=True), *_bus_lines(bus)]
-    if found["adapters"] or found["adapters_problem"]:
-        lines += ["", style("other CAN adapters, by python-can", underline=True)]
-        for adapter in found["adapters"]:
-            details = ", ".join(f"{key} {value}" for key, value in adapter.details.items())
-            lines += _wrapped(f"{style(adapter.bus, bold=True)}  {details}".rstrip(), first="")
-        lines += _advice([found["adapters_problem"]] if found["adapters_problem"] else [])
     if found["ports"]:
         lines += ["", style("serial ports", underline=True)]
         for port in found["ports"]:
             lines += ["", *_port_lines(port)]
-    elif not can["interfaces"] and not found["buses"] and not found["adapters"]:
-        lines += ["", "no serial port and no other CAN adapter"]
+    elif not can["interfaces"] and not found["buses"]:
+        lines += ["", "no serial port"]
     return lines[1:] if lines and not lines[0] else lines
 
 

@@ -1,4 +1,4 @@
-"""Find CAN interfaces of the kernel, and adapters through the libraries of their makers."""
+"""Find CAN interfaces of the kernel."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import contextlib
 import dataclasses
 import errno
 import json
-import os
 import shutil
 import socket
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -168,88 +166,3 @@ def _number(path: Path, base: int = 10) -> int | None:
         return int(text_of(path), base)
     except ValueError:
         return None
-
-
-_NOT_ASKED = ("socketcan", "serial", "virtual", "udp_multicast", "socketcand")
-"""Found in other ways, not adapters, or (socketcand) a search of four seconds in the network."""
-
-
-@dataclass(frozen=True)
-class CanAdapterFound:
-    """A channel of an adapter.
-
-    Attributes:
-        bus: its name for ``--bus``: ``kvaser:0``.
-    """
-
-    bus: str
-    details: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Detection:
-    """The adapters that python-can found, and an error, else empty."""
-
-    found: list[CanAdapterFound] = field(default_factory=list)
-    problem: str = ""
-
-
-def detect_adapters(timeout_s: float, command: list[str] | None = None) -> Detection:
-    """Search with all interfaces of python-can that can."""
-    process = subprocess.Popen(
-        command or [sys.executable, "-m", __name__],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    in_time = True
-    try:
-        output, _ = process.communicate(timeout=timeout_s)
-    except subprocess.TimeoutExpired:
-        in_time = False
-        process.kill()
-        output, _ = process.communicate()
-    found, asked, is_over = _read(output)
-    if is_over:
-        return Detection(found)
-    how = f"did not answer within {timeout_s:g} s" if not in_time else "ended the search"
-    return Detection(found, f"python-can's interface {asked!r} {how}" if asked else f"python-can {how}")
-
-
-def _read(output: str) -> tuple[list[CanAdapterFound], str, bool]:
-    """Return the adapters, the interface that searched last, and whether the search ended; skip other output."""
-    found: list[CanAdapterFound] = []
-    asked = ""
-    for line in output.splitlines():
-        try:
-            report = json.loads(line)
-            asked, configs = report["asked"], report["configs"]
-        except (ValueError, TypeError, KeyError):
-            continue
-        if asked is None:
-            return found, "", True
-        for config in configs:
-            interface, channel = config.pop("interface", asked), config.pop("channel", "")
-            found.append(CanAdapterFound(f"{interface}:{channel}", config))
-    return found, asked, False
-
-
-def _report(asked: str | None, configs: list[dict[str, Any]]) -> None:
-    sys.stdout.write(json.dumps({"asked": asked, "configs": configs}, default=str) + "\n")
-    sys.stdout.flush()
-
-
-def main() -> None:
-    """Search with one interface after the other; report each before it searches, and what it found."""
-    import can
-
-    for name in sorted(set(can.VALID_INTERFACES) - set(_NOT_ASKED)):
-        _report(name, [])
-        _report(name, [dict(config) for config in can.detect_available_configs(interfaces=[name])])
-    _report(None, [])
-    os._exit(0)  # without the threads and exit handlers of the libraries
-
-
-if __name__ == "__main__":
-    main()

@@ -17,7 +17,7 @@ from skinware.cli._command import exit_status
 from skinware_drivers.can import roboskin_setup
 from skinware_drivers.cli.find import command
 from skinware_drivers.finding import interfaces, ports
-from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
+from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.driving import emulated_on_a_pty
 from tests.commands import running
@@ -42,13 +42,11 @@ def machine(
     def make(
         can: list[CanInterface] | None = None,
         tty: list[SerialPort] | None = None,
-        found: Detection | None = None,
         kernel_has_can: bool = True,
     ) -> None:
         monkeypatch.setattr(interfaces, "can_interfaces", lambda: can or [])
         monkeypatch.setattr(interfaces, "kernel_has_can", lambda: kernel_has_can)
         monkeypatch.setattr(ports, "serial_ports", lambda: tty or [])
-        monkeypatch.setattr(interfaces, "detect_adapters", lambda _timeout_s: found or Detection())
 
     monkeypatch.setattr(roboskin_setup, "_DISCOVERY_S", 0.1)
     make()
@@ -86,9 +84,7 @@ def test_a_machine_with_everything(capsys: pytest.CaptureFixture[str], machine: 
     up = dataclasses.replace(
         CAN0, name="can1", bit_rate=500_000, data_bit_rate=2_000_000, state="BUS-OFF", restart_ms=0
     )
-    machine(
-        [CAN0, up], [TTY], Detection([CanAdapterFound("kvaser:0", {"device_name": "Leaf"})], "python-can's pcan hung")
-    )
+    machine([CAN0, up], [TTY])
     text = found(capsys)
     assert fits(text), text
     for words in (
@@ -96,8 +92,6 @@ def test_a_machine_with_everything(capsys: pytest.CaptureFixture[str], machine: 
         "      sudo ip link set can0 type can bitrate 1000000 restart-ms 100\n      sudo ip link set can0 up",
         "500 kbit/s, data 2000 kbit/s, bus-off",
         "received 12,345, sent 0, rx errors 7",
-        "kvaser:0  device_name Leaf",
-        "python-can's pcan hung",
         "/dev/ttyUSB0  FTDI FT232R USB UART, 0403:6001, serial number A50285BI,",
         "  /dev/skin/A50285BI",
         "whether a program of another user has it open is not known",
@@ -108,10 +102,9 @@ def test_a_machine_with_everything(capsys: pytest.CaptureFixture[str], machine: 
     data = found_data(capsys)
     assert [one["name"] for one in data["can"]["interfaces"]] == ["can0", "can1"]
     assert data["can"]["interfaces"][0]["heard"] is None
-    assert data["adapters"] == [{"bus": "kvaser:0", "details": {"device_name": "Leaf"}}]
     (port,) = data["ports"]
     assert (port["path"], port["usb"]["serial_number"], port["may_open"]) == ("/dev/ttyUSB0", "A50285BI", False)
-    assert data.keys() == {"can", "buses", "adapters", "adapters_problem", "ports"}
+    assert data.keys() == {"can", "buses", "ports"}
 
 
 def test_what_is_heard_is_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,7 +37,7 @@ from skinware_drivers.cli.find import command as find
 from skinware_drivers.cli.import_ import command as import_
 from skinware_drivers.cli.replay import command as replay
 from skinware_drivers.finding import interfaces, ports
-from skinware_drivers.finding.interfaces import CanAdapterFound, CanInterface, Detection
+from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
@@ -240,9 +240,6 @@ def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, mo
     tty = SerialPort("/dev/ttyUSB0", "ftdi_sio", usb, ("/dev/skin/A5",), False, "dialout", False, (User(1, "init"),))
     monkeypatch.setattr(interfaces, "can_interfaces", lambda: [can0])
     monkeypatch.setattr(ports, "serial_ports", lambda: [tty])
-    monkeypatch.setattr(
-        interfaces, "detect_adapters", lambda _timeout_s: Detection([CanAdapterFound("kvaser:0", {"x": "y"})], "")
-    )
     machine = printing(find, "--probe", "--listen", "0.1")
     monkeypatch.setattr(interfaces, "can_interfaces", list)
     heard = printing(find, f"{VIRTUAL}&streaming=yes", "--probe", "--listen", "1")

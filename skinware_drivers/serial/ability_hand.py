@@ -13,20 +13,18 @@ temperatures. Answers of kind 2 have no touch.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.geometry import Geometry
-from skinware.sensor_types import FORCE_Z, PRESSURE, SensorType
+from skinware.sensor_types import PRESSURE
 from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Options, Patch, Poll, taxels
 from skinware_drivers.fields import Bits, Identifier, Packed, Sentinel
 from skinware_drivers.hand import Grid, Hand
-from skinware_drivers.layout import Expand, Frame, Layout, Values
+from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import HDLC, LRC, Delimited, Field, SerialAdapter, Split
 
 _READ_TOUCH, _READ_NO_TOUCH = b"\xa0", b"\xa2"
@@ -42,10 +40,6 @@ _FINGER = 0x100
 """First identifier of the parts of an answer; lower ones are headers and addresses."""
 _WITHOUT_TOUCH = Match(0x02, 0x70F)
 _IDENTIFY_S = 0.3
-_C1, _C2, _DIVIDER_OHM = 121591.0, 0.878894, 1e4
-"""Placeholders: the maker says that the sensors are not calibrated."""
-
-_Bytes = npt.NDArray[np.uint8]
 
 
 class AbilityHandOptions(Options, frozen=True):
@@ -53,10 +47,6 @@ class AbilityHandOptions(Options, frozen=True):
     period_ms: Annotated[int, Meta(ge=2, description="time from question to question, ms")] = 10
     side: Annotated[Literal["right", "left"], Meta(description="which hand it is, for views")] = "right"
     zero: Annotated[Literal["suspect", "good"], Meta(description="status of a sensor that reads 0")] = "suspect"
-    force: Annotated[
-        Literal["no", "published", "divider"],
-        Meta(description="newton instead of counts, by the maker's uncalibrated formula; divider: with its other sign"),
-    ] = "no"
 
 
 def _by_finger(header: int, body: bytes) -> Iterable[tuple[int, bytes]]:
@@ -72,31 +62,22 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
 
     framing = Split(Delimited(HDLC, maximum_body=_BODY, checksum=LRC, identifier=Field(0)), _by_finger)
     baudrate = 460_800
+    types = (PRESSURE.measured(unit="counts", minimum=0, maximum=_MOST),)
+    dtype = np.uint16
 
     def __init__(self, options: AbilityHandOptions) -> None:
         super().__init__(options)
         zero, most = Sentinel(Status.SUSPECT, 0), Sentinel(Status.OUT_OF_RANGE, _MOST)
-        kind: SensorType = PRESSURE.measured(unit="counts", minimum=0, maximum=_MOST)
-        values: Values | Expand = Values(0, Packed(12, order="little"), _N)
-        self.dtype = np.uint16
-        if options.force != "no":
-            newton = partial(_newton, sign=1 if options.force == "published" else -1)
-            values, self.dtype = Expand(partial(_expand, newton=newton)), np.float32
-            most = Sentinel(Status.OUT_OF_RANGE, float(newton(np.array([_MOST]))[0]))
-            kind = FORCE_Z.measured(minimum=0)
         flags = [zero, most] if options.zero == "suspect" else [most]
-        self.types = (kind,)
+        values = Values(0, Packed(12, order="little"), _N)
         finger = Identifier(_FINGER, 0x7F8)
         self.layout = Layout([Frame("finger", [finger], [_FINGER_BYTES], values, module=Bits(0, 3), flags=flags)])
-        modules = [
-            Module(taxels(_N, kind.name, first_uid=_N * key), key, "6 points", name)
-            for key, name in enumerate(_FINGERS)
-        ]
+        modules = [Module(taxels(_N, first_uid=_N * key), key, "6 points", name) for key, name in enumerate(_FINGERS)]
         self.patches = (Patch(f"{options.side} hand", modules),)
         hand, found = Hand(options.side), []
         for key, name in enumerate(_FINGERS):
             [place] = hand.down(name, [_SITES])
-            found.append(_SITES.at(place, [kind.name], range(_N * key, _N * (key + 1)), _CELLS))
+            found.append(_SITES.at(place, ["pressure"], range(_N * key, _N * (key + 1)), _CELLS))
         self.geometry = Geometry.joined(found)
 
     @property
@@ -114,17 +95,3 @@ class AbilityHandDriver(SerialAdapter[AbilityHandOptions]):
         address = AbilityHandOptions().address
         await link.request(address, _READ_NO_TOUCH, _WITHOUT_TOUCH, timeout_s=_IDENTIFY_S)
         return f"Ability Hand at address {address:#x}"
-
-
-def _newton(counts: npt.NDArray[Any], sign: int) -> npt.NDArray[np.float32]:
-    """Return C1 / R + C2, where R = 33000 / V + sign * 10000 and V = 3.3 * counts / 4096; 0 for 0 counts."""
-    over_r = counts / (_DIVIDER_OHM * (_MOST + 1 + sign * counts))
-    return np.where(counts > 0, _C1 * over_r + _C2, 0).astype(np.float32)
-
-
-def _expand(payload: _Bytes, length: _Bytes, newton: Any) -> tuple[Any, Any, npt.NDArray[np.float32]]:
-    pairs = payload[:, :_FINGER_BYTES].astype(np.int64).reshape(-1, _N // 2, 3)
-    low, middle, high = pairs[..., 0], pairs[..., 1], pairs[..., 2]
-    counts = np.stack([low | (middle & 0xF) << 8, middle >> 4 | high << 4], axis=2).ravel()
-    row, channel = np.divmod(np.arange(len(length) * _N), _N)
-    return row, channel, newton(counts)

@@ -25,7 +25,7 @@ from typing import Annotated, Literal
 import numpy as np
 from msgspec import Meta
 
-from skinware.errors import BusError, HandshakeTimeout
+from skinware.errors import BusError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
 from skinware_drivers.fields import DeviceTime, Identifier
@@ -167,15 +167,6 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self._period_ms = ms
         self.period_s = ms / 1e3
         await self.configure(link)
-
-    @operation(looks=True)
-    async def alive(self, link: Link, patches: Sequence[Patch]) -> bool:  # noqa: ARG002
-        """Return whether the device answers."""
-        try:
-            await link.request(0, command(_ALIVE), Match(_ALIVE), timeout_s=_TIMEOUT_S)
-        except HandshakeTimeout:
-            return False
-        return True
 
     @staticmethod
     async def _ask(link: Link, tries: int = _TRIES) -> bytes:

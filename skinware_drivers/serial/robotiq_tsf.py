@@ -18,7 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -164,9 +164,6 @@ def _fields(data: bytes) -> list[tuple[int, int, bytes]] | None:
 
 class RobotiqTsfOptions(Options, frozen=True):
     period_ms: Annotated[int, Meta(ge=1, le=255, description="time between two packets that the sensor sends, ms")] = 10
-    autosend: Annotated[
-        Literal["synchronous", "asynchronous"], Meta(description="how the sensor sends by itself: command 58 or 59")
-    ] = "synchronous"
     learn_s: Annotated[
         float, Meta(ge=0.1, le=60, description="time to learn fingers and how often each kind of value comes, s")
     ] = 1.0
@@ -228,11 +225,10 @@ class RobotiqTsfDriver(SerialAdapter[RobotiqTsfOptions]):
 
     async def start(self, link: Link) -> None:
         """Let the sensor send by itself."""
-        command = _SYNCHRONOUS if self.options.autosend == "synchronous" else _ASYNCHRONOUS
-        await link.send(command, bytes([self.options.period_ms]))
+        await link.send(_SYNCHRONOUS, bytes([self.options.period_ms]))
 
     async def stop(self, link: Link) -> None:
-        await link.send(_SYNCHRONOUS if self.options.autosend == "synchronous" else _ASYNCHRONOUS, b"\0")
+        await link.send(_SYNCHRONOUS, b"\0")
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003

@@ -46,8 +46,7 @@ from skinware_drivers.serial.stream import Part, Split, by_length
 log: logging.Logger = logging.getLogger("skinware.driver")
 
 _ASK, _VERSION, _OFFSET = 0x01, 0x08, 0x0B
-_FINGERTIPS = 5
-_EVERYTHING = bytes((1, 2, 3, 4, _FINGERTIPS))
+_EVERYTHING = bytes((1, 2, 3, 4, 5))
 _FINGER = 0x100  # identifier of the frame of finger 0
 _HEADER, _MOTOR = 3, 8
 _VERSIONS = frozenset({(_VERSION, 7), (_VERSION, 9)})
@@ -114,17 +113,10 @@ _MEASURED: dict[int, Sequence[str]] = {2: _FORCES, 4: [*_FORCES, "torque_z"]}
 class TesolloOptions(Options, frozen=True):
     period_ms: Annotated[int, Meta(ge=1, le=1000, description="time between two questions, ms")] = 10
     timeout_ms: Annotated[int, Meta(ge=1, le=5000, description="wait for an answer before asking again, ms")] = 30
-    ask: Annotated[
-        Literal["everything", "fingertips"],
-        Meta(description="everything, as the maker's program asks; or fingertips alone: shorter, not documented"),
-    ] = "everything"
     sensors: Annotated[
         Literal[0, 1, 2, 3, 4, 5],
         Meta(description="kind of sensors, for hands whose firmware does not report it; 0: ask the hand"),
     ] = 0
-    cells: Annotated[
-        Literal["by_row", "by_column"], Meta(description="order in which a grid's cells are sent: not documented")
-    ] = "by_row"
 
 
 class _Hand(NamedTuple):
@@ -153,8 +145,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        what = _EVERYTHING if self.options.ask == "everything" else bytes([_FINGERTIPS])
-        return [Poll(_ASK, what, self.period_s, Match(_FINGER, 0x700), self.options.timeout_ms / 1e3)]
+        return [Poll(_ASK, _EVERYTHING, self.period_s, Match(_FINGER, 0x700), self.options.timeout_ms / 1e3)]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the hand for its model and its sensors.
@@ -184,7 +175,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
             for finger in hand.fitted
         ]
         self.geometry = _geometry(model, tip, hand.fitted, [kind.name for kind in self.types])
-        self.layout = _layout(hand, tip, self._order(tip))
+        self.layout = _layout(hand, tip)
         self.change_framing(self._framing(hand))
         return [Patch(model.name, modules)]
 
@@ -233,16 +224,10 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         types = [axis for axis in _AXES if axis.name in names]
         return types, [axis.name if axis.name in names else None for axis in _AXES]
 
-    def _order(self, tip: _Tip) -> Sequence[int]:
-        if tip.grid is None or self.options.cells == "by_row":
-            return range(tip.values)
-        rows, columns = tip.grid.rows, tip.grid.columns
-        return [columns * row + column for column in range(columns) for row in range(rows)]
-
     def _framing(self, hand: _Hand) -> Framing:
         """Return the framing of this hand's answers, with bytes of all fingers or only of those with a sensor."""
         model, tip = _MODELS[hand.model], _TIPS[hand.sensors]
-        start = _MOTOR * model.motors if self.options.ask == "everything" else 0
+        start = _MOTOR * model.motors
         answers = {}
         for present in (hand.fitted, tuple(range(model.fingers))):
             places = {finger: start + tip.size * place for place, finger in enumerate(present)}
@@ -254,10 +239,10 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         return Split(whole, by_length(answers))
 
 
-def _layout(hand: _Hand, tip: _Tip, order: Sequence[int]) -> Layout:
+def _layout(hand: _Hand, tip: _Tip) -> Layout:
     ends = np.iinfo(np.dtype(tip.dtype))
     saturated = [Sentinel(Status.OUT_OF_RANGE, end) for end in (ends.min, ends.max) if end]
-    values = Values(0, tip.dtype, tip.values, to=order)
+    values = Values(0, tip.dtype, tip.values)
     frames = [
         Frame(f"finger {number}", [Identifier(_FINGER | number)], [tip.size], values, module=number, flags=saturated)
         for number in hand.fitted

@@ -274,12 +274,11 @@ class TestTesollo(DriverConformance):
 
 
 @pytest.mark.thorough
-class TestTesolloShort(DriverConformance):
-    """Three of five fingers have sensors of 16 bits; the fingertips are asked for alone."""
+class TestTesolloPads(DriverConformance):
+    """Three of five fingers have sensors of 16 bits."""
 
     driver = TesolloDriver
     emulator = EmulatedTesollo
-    driver_options: ClassVar[Mapping[str, Any]] = {"ask": "fingertips"}
     emulator_options: ClassVar[Mapping[str, Any]] = {"tips": "tactile_s", "fitted": 0b01011, "pads": True}
 
 

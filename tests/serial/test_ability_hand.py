@@ -126,17 +126,6 @@ def test_it_is_told_if_another_program_asks_for_answers_without_touch(caplog: py
             wait_until(is_told)
 
 
-@pytest.mark.parametrize(("force", "of_2048"), [("published", 121591 / 30000 + 0.878894), ("divider", 13.037994)])
-def test_newton_by_the_placeholder_formula(force: str, of_2048: float) -> None:
-    """Of 2048 counts: 1.65 V, 20 kOhm; and 10 kOhm more, or less."""
-    frame, _ = shown(answer(0xA0, bytes.fromhex("00 F8 FF")), force=force)
-    assert frame.structure.types[0].name == "force_z"
-    assert frame.structure.types[0].unit == "N"
-    assert frame.values[0] == pytest.approx(of_2048)
-    assert frame.values[2] == 0
-    assert (frame.status[1], frame.status[2]) == (Status.OUT_OF_RANGE, Status.SUSPECT)
-
-
 class Watched(EmulatedAbilityHand):
     """A hand of which it is known how often it was told to move."""
 

@@ -67,7 +67,6 @@ def test_a_device_that_streams_already_and_describes_itself() -> None:
         assert structure.sensor_module.tolist() == [0] * 5 + [1] * 300
         frame = read_until(reader, lambda f: len(set(f.values.tolist())) == 1)
         assert frame.module_time_ns[0] == frame.module_time_ns[1]
-        assert reader.call("alive") == {"bus0": True}
         with pytest.raises(RequestFailed, match="give 1 to 6553"):
             reader.call("period", ms=0)
         reader.call("period", ms=10)

@@ -49,7 +49,6 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
 
 
 class EmulatedAllegroV5TipsOptions(EmulatedAllegroV5Options, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    as_in_manual: Annotated[bool, Meta(description="identifiers of the manual, not those of real hands")] = False
     air_pa: Annotated[int, Meta(ge=0, description="pressure of an untouched fingertip, Pa")] = 0
 
 
@@ -67,8 +66,7 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
 
     def frames(self, device: Device, values: Sequence[int]) -> Sequence[CanFrame]:  # noqa: ARG002
         pascals = [value + self.options.air_pa for value in values]
-        first = 0x050 if self.options.as_in_manual else 0x0F0
-        return [(first << 2, struct.pack("<2i", *pascals[:2])), (first + 2 << 2, struct.pack("<2i", *pascals[2:]))]
+        return [(0x0F0 << 2, struct.pack("<2i", *pascals[:2])), (0x0F2 << 2, struct.pack("<2i", *pascals[2:]))]
 
 
 class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):

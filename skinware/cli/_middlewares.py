@@ -74,14 +74,6 @@ log = logging.getLogger(__name__)
     help="Release of the other nodes; jazzy: Iron and later.  [default: $ROS_DISTRO, else jazzy]",
 )
 @click.option("--rate", type=float, default=20.0, metavar="HZ", help="Highest rate of point clouds and images.")
-@click.option(
-    "--root-frame",
-    default="",
-    show_default=False,
-    metavar="NAME",
-    help="Publish /tf_static, if no other node does: all coordinate frames of the drivers at the origin of NAME,"
-    " without rotation.",
-)
 @click.option("--tare", "with_tare", is_flag=True, help="Offer a service NAME/tare to everyone in the graph.")
 @cli.namespace_option
 @cli.json_option
@@ -94,7 +86,6 @@ def ros2(
     ros_namespace: str,
     distro: str,
     rate: float,
-    root_frame: str,
     with_tare: bool,
     namespace: str | None,
     as_json: bool,
@@ -149,7 +140,6 @@ def ros2(
             names,
             prefix=identity.prefix,
             rate_hz=rate,
-            root_frame=root_frame,
             with_tare=with_tare,
             trouble=cli.warn,
         )

@@ -37,12 +37,6 @@ TEXTS = {
     "diagnostic_msgs/KeyValue": _KEY_VALUE,
     "diagnostic_msgs/DiagnosticStatus": _DIAGNOSTIC_STATUS,
     "diagnostic_msgs/DiagnosticArray": "std_msgs/Header header\ndiagnostic_msgs/DiagnosticStatus[] status\n",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
-    "geometry_msgs/TransformStamped": (
-        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform\n"
-    ),
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms\n",
     "rmw_dds_common/Gid": "uint8[16] data\n",
     "rmw_dds_common/NodeEntitiesInfo": _NODE_ENTITIES,
     "rmw_dds_common/ParticipantEntitiesInfo": _PARTICIPANT_ENTITIES,
@@ -63,9 +57,6 @@ SENSORS = MessageType(
 )
 DIAGNOSTICS = MessageType(
     "diagnostic_msgs/msg/DiagnosticArray", "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
-)
-TRANSFORMS = MessageType(
-    "tf2_msgs/msg/TFMessage", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 )
 TRIGGER = ServiceType(
     "std_srvs/srv/Trigger",
@@ -89,7 +80,6 @@ DISCOVERY_TOPIC = "ros_discovery_info"
 """Where ROS 2 publishes, over DDS, which node has which endpoints."""
 PARTICIPANT_DATA = b"enclave=/;"
 """User data of a participant: without it, ROS does not count it as one of its own."""
-_AT_ITS_ORIGIN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 """x, y, z (m), and the quaternion x, y, z, w of no rotation."""
 
 
@@ -118,14 +108,6 @@ def diagnostics(statuses: Collection[DiagnosticStatus], time_ns: int) -> bytes:
         cdr.numbers("I", len(status.values))
         for key, value in status.values.items():
             cdr.text(key).text(value)
-    return cdr.done()
-
-
-def transforms(parent: str, children: Collection[str], time_ns: int) -> bytes:
-    """Return a ``tf2_msgs/TFMessage`` of coordinate frames that coincide with their parent; ``time_ns``: wall clock."""
-    cdr = Cdr().numbers("I", len(children))
-    for child in children:
-        cdr.header(time_ns, parent).text(child).numbers("d", *_AT_ITS_ORIGIN)
     return cdr.done()
 
 

@@ -1,4 +1,4 @@
-"""Publish the drivers of a namespace in a ROS 2 graph: topics, diagnostics, coordinate frames, and taring."""
+"""Publish the drivers of a namespace in a ROS 2 graph: topics, diagnostics, and taring."""
 
 from __future__ import annotations
 
@@ -110,29 +110,6 @@ class DriverTopics:
             self.left_out += 1
 
 
-class Transforms:
-    """Publishes a static transform from a root to each coordinate frame: at its origin, without rotation.
-
-    Skinware does not know where coordinate frames are relative to each other.
-    """
-
-    def __init__(self, node: Node, root: str) -> None:
-        self._root = root
-        self._frames: set[str] = set()
-        self._publisher = node.publisher("/tf_static", messages.TRANSFORMS, _LATCHED)
-
-    def add(self, structure: Structure) -> None:
-        """Publish the frames of a driver's sensors together with those of other drivers, if any is new."""
-        geometry = structure.geometry
-        new = set() if geometry is None else set(geometry.frame[geometry.known].tolist()) - {"", self._root}
-        if new - self._frames:
-            self._frames |= new
-            self._publisher.publish(messages.transforms(self._root, sorted(self._frames), time.time_ns()))
-
-    def close(self) -> None:
-        self._publisher.close()
-
-
 @dataclass(frozen=True)
 class ServedReport:
     """State of a driver, and traffic of its topics.
@@ -192,7 +169,6 @@ class Ros2Server:
     Args:
         prefix: before all topics: empty or ``/robot_1``.
         rate_hz: of point clouds and images, at most.
-        root_frame: parent of all coordinate frames in ``/tf_static``; empty: no such topic.
         with_tare: offer everyone in the graph a service for each driver that tares it.
         trouble: called with each new problem, one line.
     """
@@ -205,14 +181,12 @@ class Ros2Server:
         *,
         prefix: str = "",
         rate_hz: float = RATE_HZ,
-        root_frame: str = "",
         with_tare: bool = False,
         trouble: Callable[[str], object] = lambda _: None,
     ) -> None:
         self._node, self._prefix, self._trouble = node, prefix, trouble
         self._period_ns = period_ns(rate_hz)
         self._with_tare = with_tare
-        self._transforms = Transforms(node, root_frame) if root_frame else None
         self._live = LiveDrivers(namespace, names)
         self._served: dict[str, _ServedDriver] = {}
         self._troubles: set[str] = set()
@@ -245,8 +219,6 @@ class Ros2Server:
             served.end_tare()
             served.topics.close()
         self._diagnostics.close()
-        if self._transforms is not None:
-            self._transforms.close()
         self._live.close()
 
     def drivers(self) -> Mapping[str, ServedReport]:
@@ -280,8 +252,6 @@ class Ros2Server:
             if self._live.poll(live) and live.frame is not None:
                 served.take(live.frame, wants_frames=wants_frames)
                 served.topics.publish(live.frame, with_pictures=is_due)
-                if self._transforms is not None:
-                    self._transforms.add(live.frame.structure)
                 if is_due:
                     served.due_ns = max(served.due_ns + self._period_ns, now_ns() + self._period_ns // 2)
             elif not served.is_over and now_ns() >= served.look_ns and self._live.get(live.name) is live:

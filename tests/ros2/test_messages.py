@@ -55,7 +55,6 @@ MESSAGE_TYPES = [
         messages.SKIN_FRAME,
         messages.SENSORS,
         messages.DIAGNOSTICS,
-        messages.TRANSFORMS,
         messages.PARTICIPANT,
     ),
     *(messages.TRIGGER.request, messages.TRIGGER.response),

@@ -254,18 +254,7 @@ def test_topics_may_be_in_a_namespace_of_ros(namespace: Namespace) -> None:
         assert "/robot/skin/arm/tare" in graph.services
 
 
-def test_coordinate_frames_are_below_a_root_that_is_asked_for(namespace: Namespace) -> None:
-    with FakeSkin("arm", small()) as arm, served(namespace, root_frame="robot") as (graph, _):
-        arm.publish()
-        transforms = told(graph, "/tf_static")[-1].transforms
-    geometry = arm.structure.geometry
-    assert geometry is not None
-    assert [each.child_frame_id for each in transforms] == sorted(set(geometry.frame[geometry.known]))
-    assert {each.header.frame_id for each in transforms} == {"robot"}
-    assert {each.transform.rotation.w for each in transforms} == {1.0}
-
-
-def test_no_transform_is_published_unasked(namespace: Namespace) -> None:
+def test_no_transform_is_published(namespace: Namespace) -> None:
     """A robot's own description places these frames: a second parent would tear its tree."""
     with FakeSkin("arm", small()) as skin, served(namespace) as (graph, _):
         graph.wanted = {FRAMES}

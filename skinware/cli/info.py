@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -62,9 +61,7 @@ _LIFE_COLOURS = {
     is_flag=True,
     help="List sensors with a fault (stuck, noisy, dead ...), here and in the namespace calm.",
 )
-@click.option(
-    "--watch", is_flag=True, help="Update every second; many patches share a line where the terminal is too low."
-)
+@click.option("--watch", is_flag=True, help="Update every second.")
 @cli.namespace_option
 @cli.json_option
 def command(name: str | None, sensors: bool, health: bool, watch: bool, namespace: str | None, as_json: bool) -> None:
@@ -103,14 +100,14 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
         say(as_json, found, "\n".join(as_text(found)))
 
 
-def as_text(found: dict[str, Any], *, brief: bool = False) -> list[str]:
-    """Return the report for people, with colours, no wider than the terminal; brief: good patches share a line."""
+def as_text(found: dict[str, Any]) -> list[str]:
+    """Return the report for people, with colours, no wider than the terminal."""
     drivers, services = found["drivers"], found["services"]
     lines = [f"namespace {found['namespace']}: {plural(len(drivers), 'driver')}, {plural(len(services), 'service')}"]
     if not drivers and not services:
         lines += ["", "Nothing runs here yet. Start a driver:", "  skin-driver --bus virtual    (needs no hardware)"]
     for driver in drivers:
-        lines += ["", *_driver_lines(driver | {"patch_list": _summed_up(driver)} if brief else driver)]
+        lines += ["", *_driver_lines(driver)]
     for service in services:
         own = [*_content_lines(service), *_statistics_lines(service), "", *_reader_lines(service)]
         lines += ["", _life_line("service", service), *_indented(own)]
@@ -176,28 +173,6 @@ def _driver_lines(driver: dict[str, Any]) -> list[str]:
         path.append(f"frames wait up to {driver['latency_ms']:g} ms to be taken together")
     lines += ["", "; ".join(path)] if path else []
     return [_life_line("driver", driver), *_indented([*lines, "", *_statistics_lines(driver), *_reader_lines(driver)])]
-
-
-def _summed_up(driver: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return patches with a problem one by one, and the others of each bus as if they were one."""
-    good: dict[str, list[dict[str, Any]]] = {}
-    for patch in driver["patch_list"]:
-        if driver["state"] == patch["state"] == "live" and patch["fresh"] == patch["sensors"]:
-            good.setdefault(patch["bus"], []).append(patch)
-    entries = [patch for patch in driver["patch_list"] if patch not in good.get(patch["bus"], ())]
-    for bus, patches in good.items():
-        entry = dict(patches[0])
-        if len(patches) > 1:
-            entry |= {"name": f"{len(patches)} patches", "bus": bus, "state": "live"}
-            entry["age_ms"] = max(patch["age_ms"] for patch in patches)
-            for key, first in patches[0].items():
-                if isinstance(first, int):
-                    entry[key] = sum(patch[key] for patch in patches)
-            for key in _TIMES_OF_A_PATCH.values():
-                if key in entry:
-                    entry[key] = max((patch[key] for patch in patches), key=lambda times: times["p99_ns"] or 0)
-        entries.append(entry)
-    return entries
 
 
 def _content_lines(service: dict[str, Any]) -> list[str]:
@@ -343,9 +318,7 @@ def _watch(namespace: Namespace, name: str | None, as_json: bool) -> None:
         if as_json:
             print_json(found)
         elif sys.stdout.isatty():
-            lines = as_text(found)
-            fits = len(lines) < shutil.get_terminal_size().lines
-            redraw(lines if fits else as_text(found, brief=True))
+            redraw(as_text(found))
         else:
             echo("\n".join([time.strftime("%H:%M:%S"), *as_text(found), ""]))
         time.sleep(_WATCH_PERIOD_S)

@@ -8,7 +8,7 @@ import click
 import numpy as np
 import pytest
 
-from skinware import DriverReader, Namespace, PatchState, Status
+from skinware import DriverReader, Namespace, Status
 from skinware.cli import info
 from skinware.cli._command import exit_status
 from skinware.cli._report import report
@@ -36,35 +36,6 @@ def test_no_line_is_wider_than_the_terminal(monkeypatch: pytest.MonkeyPatch) -> 
     words = " ".join(lines)
     for title in ("interval 99 %", "delay 99 %", "orphans", "data age", "not taken"):
         assert title in words
-
-
-def test_many_patches_that_are_in_order_share_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(info, "terminal_width", lambda: 80)
-    with FakeSkin("a", fake_structure(20, 1, buses=2)) as skin:
-        skin.interval_counts[:, 20] = skin.age_counts[:, 16] = 7
-        skin.interval_counts[12, 24] = 1000
-        skin.publish(3)
-        found = report(Namespace())
-        assert len(as_text(found)) > 40
-        assert len(as_text(found, brief=True)) < 24
-        skin.patch_state[3] = PatchState.STALE
-        skin.status[:12] = Status.NOT_CONNECTED
-        skin.publish(3)
-        found = report(Namespace())
-        brief = [click.unstyle(line) for line in as_text(found, brief=True)]
-    table = "\n".join(brief)
-    assert re.search(r"board 7 +can0 +not fresh +0 of 12", table)
-    assert re.search(r"board 10 +can0 +stale +12 of 12", table)
-    assert re.search(r"8 patches +can0 +live +96 of 96", table)
-    assert re.search(r"10 patches +can1 +live +120 of 120.* 17 ms", table)
-
-
-def test_a_patch_that_is_alone_in_order_keeps_its_name() -> None:
-    with FakeSkin("a", fake_structure(2, 1, buses=2)) as skin:
-        skin.publish(3)
-        text = "\n".join(as_text(report(Namespace()), brief=True))
-    assert re.search(r"board 7 +can0 +live", text)
-    assert re.search(r"board 8 +can1 +live", text)
 
 
 def test_modules_that_have_sent_nothing_but_0_are_fresh_and_said(capsys: pytest.CaptureFixture[str]) -> None:

@@ -113,7 +113,6 @@ class GatheringOptions:
     share: float
     duration_s: float | None
     state: Path | None
-    fresh: bool
     namespace: str | None
     as_json: bool
 
@@ -127,7 +126,6 @@ class Gathering:
         poses: PoseSource | ForceSource | None,
         state_path: Path,
         *,
-        fresh: bool,
         as_json: bool,
     ) -> None:
         self._reader, self._session, self.source, self.poses = reader, session, source, poses
@@ -135,7 +133,7 @@ class Gathering:
         self.structure: Structure = reader.structure
         self.type_name: str = source.type_name
         self._uid: npt.NDArray[np.uint64] = reader.structure.sensor_uid[reader.structure.index(source.type_name)]
-        self.restored: bool = not fresh and restore_session(state_path, session, source.type_name, self._uid)
+        self.restored: bool = restore_session(state_path, session, source.type_name, self._uid)
         self._reported = -1.0
 
     def run(self, what_to_do: str, share: float, duration_s: float | None) -> None:
@@ -253,20 +251,20 @@ def opened(
     file: Path,
     session_of: Callable[[int], Any],
     how: GatheringOptions,
-    poses: tuple[str, str | None, str, tuple[int, ...]] | None = None,
+    poses: tuple[str, str, tuple[int, ...]] | None = None,
 ) -> Iterator[tuple[Gathering, Any]]:
     with ExitStack() as stack:
-        reader = stack.enter_context(reader_of(Namespace(how.namespace), how.driver, "--driver"))
+        namespace = Namespace(how.namespace)
+        reader = stack.enter_context(reader_of(namespace, how.driver, "--driver"))
         source = LoadSource(reader.structure, reader.driver_type, how.type_name)
         pose_source = None
         if poses is not None:
-            service, poses_namespace, column, shape = poses
-            place = Namespace(poses_namespace or how.namespace)
-            pose_reader = stack.enter_context(ServiceReader(service, namespace=place, timeout_s=_POSES_TIMEOUT_S))
+            service, column, shape = poses
+            pose_reader = stack.enter_context(ServiceReader(service, namespace=namespace, timeout_s=_POSES_TIMEOUT_S))
             pose_source = PoseSource(pose_reader, column, shape)
         state_path = how.state or file.with_name(f"{file.name}.state.npz")
         session = session_of(len(reader.structure.module_of(source.type_name)))
-        gathering = Gathering(reader, session, source, pose_source, state_path, fresh=how.fresh, as_json=how.as_json)
+        gathering = Gathering(reader, session, source, pose_source, state_path, as_json=how.as_json)
         yield gathering, session
 
 

@@ -44,14 +44,12 @@ _gathering = cli.options(
     ),
     cli.duration_option("Gather for SECONDS at most; 0: use the state file as it is."),
     click.option("--state", metavar="FILE", type=cli.FILE, help="File of gathered data.  [default: output.state.npz]"),
-    click.option("--fresh", is_flag=True, help="Begin with nothing, and ignore that file."),
     cli.namespace_option,
     cli.json_option,
     cli.version_option,
 )
 _pressing = cli.options(
     click.option("--poses", "service", metavar="SERVICE", required=True, help="Service that publishes poses."),
-    click.option("--poses-namespace", metavar="NAME", help="Namespace of that service.  [default: as --namespace]"),
     click.option("--touches", type=click.IntRange(1), default=5, help="Wanted on each sensor."),
     click.option("--frame", metavar="NAME", help="Coordinate frame of the poses.  [default: name of the service]"),
 )
@@ -120,7 +118,6 @@ def topology(file: Path, pitch_m: float, **options: Any) -> None:
 def touch(
     file: Path,
     service: str,
-    poses_namespace: str | None,
     touches: int,
     frame: str | None,
     column: str,
@@ -152,7 +149,7 @@ def touch(
     if offset_m and layout is None:
         raise click.UsageError("--offset needs --layout, which has the normals")
     session_of = partial(PressSession, wanted=touches)
-    where = (service, poses_namespace, column, (3,))
+    where = (service, column, (3,))
     with opened(file, session_of, how, where) as (gathering, session):
         structure, type_name, shapes, layout_m, is_here = gathering.structure, gathering.type_name, None, None, False
         if layout is not None:
@@ -190,7 +187,6 @@ def touch(
 def finger(
     file: Path,
     service: str,
-    poses_namespace: str | None,
     touches: int,
     frame: str | None,
     column: str,
@@ -211,7 +207,7 @@ def finger(
 
     how = GatheringOptions(**options)
     session_of = partial(PressSession, wanted=touches, pose_shape=(4, 4))
-    where = (service, poses_namespace, column, (4, 4))
+    where = (service, column, (4, 4))
     with opened(file, session_of, how, where) as (gathering, session):
         structure, type_name = gathering.structure, gathering.type_name
         _, shapes = read_layout(structure, type_name, layout)
@@ -306,7 +302,7 @@ def force(
     how = GatheringOptions(**options)
     if (reference is None) == (not newtons) and how.duration_s != 0:
         raise click.UsageError("give either --reference or --newtons")
-    where = None if reference is None else (reference, how.namespace, column, (int(axes),))
+    where = None if reference is None else (reference, column, (int(axes),))
     with opened(file, ForceSession, how, where) as (gathering, session):
         source = gathering.poses = ForceSource(gathering.source, gathering.poses)
         for weight_n in newtons:

@@ -10,13 +10,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
-import msgspec
-
 from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.cli.emulation import Emulation
-from skinware_drivers.options import NoOptions
+from skinware_drivers.options import NoOptions, options_of
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.generation import FlowLoop
@@ -195,7 +193,7 @@ def emulated_on(bus: Bus, emulator: Any, **options: Any) -> Iterator[None]:
     """
     if isinstance(emulator, str):
         emulator = load_emulator(emulator)
-    with carried_on(bus, emulator(msgspec.convert(options, emulator.Options, strict=False))):
+    with carried_on(bus, emulator(options_of(emulator, options))):
         yield
 
 
@@ -267,7 +265,7 @@ def emulated_skin(
             it has devices already.
     """
     driver_class = load_driver(driver) if isinstance(driver, str) else driver
-    adapter = driver_class(msgspec.convert(dict(driver_options or {}), driver_class.Options, strict=False))
+    adapter = driver_class(options_of(driver_class, driver_options or {}))
     factory: Any = emulator or (load_emulator(driver) if isinstance(driver, str) else None)
     hardware: EmulatedHardware | None = None
     with ExitStack() as running:
@@ -283,7 +281,7 @@ def emulated_skin(
         if bus or factory is None:
             line = make_bus(bus, payload_size=adapter.payload_size)
         else:
-            hardware = factory(msgspec.convert(emulator_options, factory.Options, strict=False))
+            hardware = factory(options_of(factory, emulator_options))
             line = VirtualCanBus("", hardware=hardware, payload_size=adapter.payload_size)
         driving = running.enter_context(driving_lines([(adapter, line)], name))
         reader = running.enter_context(DriverReader(name, timeout_s=_LONGEST_S))

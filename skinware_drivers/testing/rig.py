@@ -8,7 +8,6 @@ import inspect
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any, ClassVar, Self, TypeVar
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -20,6 +19,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch, identifier_text
 from skinware_drivers.link import Link
+from skinware_drivers.options import options_of
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.waiting import defect, require, run_in_its_time
@@ -315,7 +315,7 @@ class Suite:
         return felt
 
     def make_adapter(self) -> AnyAdapter:
-        adapter = self.driver(msgspec.convert(dict(self.driver_options), self.driver.Options, strict=False))
+        adapter = self.driver(options_of(self.driver, self.driver_options))
         try:
             adapter.check()
         except ConfigurationError as error:
@@ -326,7 +326,7 @@ class Suite:
         """Return the options of the devices, with those of ``more`` that they have."""
         known = self.emulator.Options.__struct_fields__
         given = {**self.emulator_options, **{name: value for name, value in more.items() if name in known}}
-        return msgspec.convert(given, self.emulator.Options, strict=False)
+        return options_of(self.emulator, given)
 
     def running(self, clock: HandClock, **more: Any) -> Running:
         """Return the running driver on devices that feel new values in each burst."""

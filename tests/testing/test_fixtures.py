@@ -7,12 +7,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from skinware import PatchState, Status
+from skinware.errors import ConfigurationError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.description import Module, Patch, taxels
@@ -77,6 +79,18 @@ def test_a_driver_on_emulated_devices_and_a_reader(emulated_skin: Callable[..., 
     read_until(skin.reader, lambda frame: bool((frame.status & Status.STALE).all()))
     skin.driver.do(skin.bus.come_back)  # type: ignore[attr-defined]
     read_until(skin.reader, lambda frame: frame.patch_state[0] == PatchState.LIVE and not frame.status.any())
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"pattern": "cylce"}, "options of EmulatedXela: Invalid enum value 'cylce'"),
+        ({"driver_options": {"period": 3}}, "options of XelaDriver: Object contains unknown field `period`"),
+    ],
+)
+def test_wrong_options_are_named(emulated_skin: Callable[..., EmulatedSkin], given: dict[str, Any], why: str) -> None:
+    with pytest.raises(ConfigurationError, match=why):
+        emulated_skin("xela", **given)
 
 
 @pytest.mark.parametrize(("driver", "emulator"), [(TapeDriver, EmulatedTape), (OpenPatchDriver, EmulatedOpenPatch)])

@@ -77,7 +77,8 @@ class Bits:
 class SequenceNumber:
     """A number in the payload that the device counts up, with a module's frames or with its cycles.
 
-    Skipped and repeated numbers are counted. In a :class:`Cycle` the number also says which frames belong together.
+    Skipped and repeated numbers are counted. A frame that one of the next 64 has overtaken is not shown, if the number
+    has more than 128 values. In a :class:`Cycle` the number also says which frames belong together.
 
     Attributes:
         offset: first byte of its word.

@@ -29,7 +29,7 @@ BUS_COUNTERS = ("unknown", "bad_length", "bad_content", "before_boot")
 booted."""
 PATCH_COUNTERS = ("updates", "orphans", "late", "sequence_lost", "sequence_repeated", "sequence_back")
 """Per patch: updates of modules; frames without partners; cycles whose frames came too late, or out of the device's
-rhythm; sequence numbers that were skipped, were repeated, or went back (out of order, or a restart)."""
+rhythm; sequence numbers that were skipped, were repeated, or went back (overtaken ones, or a restart)."""
 _PROMPT = 1.5
 """The longest period of a group that frames wait for, in periods of the driver."""
 
@@ -162,7 +162,8 @@ class Decoder:
 
     Attributes:
         samples: for each bus, some of the frames that could not be used.
-        last_sequence: (n_modules,) int64, the last sequence number of each; -1: none yet.
+        last_sequence: (n_modules, 3) int64, of each the newest sequence number, which of the 64 before came (as bits),
+            and one that was left out; -1: none yet.
         module_flags: (n_modules,) uint8, status bits that status frames set for other modules.
         haste: (n_patches,) int64, frames that came too soon, since a whole cycle came.
         knows_clock: (n_patches,) bool, something is known of the device's own clock.
@@ -179,7 +180,7 @@ class Decoder:
         self._module_patch = structure.module_patch.astype(np.intp)
         self.state: SkinState = SkinState(self.tables)
         self.samples: list[Samples] = [Samples() for _ in layouts]
-        self.last_sequence = np.full(structure.n_modules, NONE_YET, np.int64)
+        self.last_sequence = np.full((structure.n_modules, 3), NONE_YET, np.int64)
         self.module_flags = np.zeros(structure.n_modules, np.uint8)
         self.haste = np.zeros(structure.n_patches, np.int64)
         self.knows_clock = np.zeros(structure.n_patches, bool)

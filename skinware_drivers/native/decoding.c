@@ -62,11 +62,16 @@ static void read_alone(struct path *path)
         update_at(path, number)->module = path->entry[row];
         read_update(path, &plan->assemblies[kind->assembly], number, &row);
     }
-    for (int64_t number = 0; number < plan->n_kinds; number++) {
-        const struct kind *kind = &plan->kinds[number];
-        for (int64_t row = path->batch->start; kind->cycle < 0 && kind->sequence.is_there && row < path->batch->stop; row++)
-            if (path->kind[row] == number && path->entry[row] < plan->n_modules)
-                compare_sequence(path, &kind->sequence, row);
+}
+
+static void leave_out_overtaken(struct path *path)
+{
+    for (int64_t row = path->batch->start; row < path->batch->stop; row++) {
+        if (path->kind[row] == NO_KIND || path->entry[row] >= path->plan->n_modules)
+            continue;
+        const struct kind *kind = &path->plan->kinds[path->kind[row]];
+        if (kind->cycle < 0 && kind->sequence.is_there && is_overtaken(path, &kind->sequence, row))
+            path->kind[row] = NO_KIND;
     }
 }
 
@@ -158,6 +163,7 @@ void decode_batch(struct path *path)
     if (path->words->expects_data)
         plan->hooks.hear();
     name_rows(path, time_ns);
+    leave_out_overtaken(path);
     tell_times(path);
     keep_after_boot(path);
     path->n_carried = 0;

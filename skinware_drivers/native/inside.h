@@ -164,7 +164,7 @@ void join_groups(const struct path *path, struct update *update, const struct as
 void read_update(struct path *path, const struct assembly *assembly, int64_t number, const int64_t *rows);
 void finish_updates(struct path *path, int64_t first);
 void add_module_flags(struct path *path, int64_t first);
-void compare_sequence(struct path *path, const struct number *sequence, int64_t row);
+bool is_overtaken(struct path *path, const struct number *sequence, int64_t row);
 void decode_batch(struct path *path);
 void take_updates(struct path *path);
 void publish_if_due(struct path *path);

@@ -187,14 +187,15 @@ static void add_orphan(struct path *path, const struct cycle *cycle, int64_t row
 
 static void add_cycle(struct path *path, const struct cycle *cycle, int64_t start)
 {
-    int64_t rows[MOST_MEMBERS], number = new_update(path);
-    if (number < 0)
-        return;
+    int64_t rows[MOST_MEMBERS];
     for (int64_t j = 0; j < cycle->n; j++)
         rows[path->place[start + j]] = path->order[start + j];
+    if (cycle->compared_member >= 0 && is_overtaken(path, &cycle->compared, rows[cycle->compared_member]))
+        return;
+    int64_t number = new_update(path);
+    if (number < 0)
+        return;
     update_at(path, number)->module = path->entry[rows[0]];
-    if (cycle->compared_member >= 0)
-        compare_sequence(path, &cycle->compared, rows[cycle->compared_member]);
     read_update(path, &path->plan->assemblies[cycle->assembly], number, rows);
 }
 

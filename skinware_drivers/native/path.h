@@ -131,6 +131,7 @@ struct hooks {             /* NULL: there is nothing to do */
 
 enum { UNKNOWN, BAD_LENGTH, BAD_CONTENT, BEFORE_BOOT, N_DECODER_COUNTERS };               /* of a bus */
 enum { UPDATES, ORPHANS, LATE, SEQUENCE_LOST, SEQUENCE_REPEATED, SEQUENCE_BACK, N_PATCH_COUNTERS }; /* of a patch */
+enum { NEWEST, CAME, LEFT_OUT, N_OF_SEQUENCE }; /* sequence numbers of a module; came: a bit for each of the 64 before */
 enum { SAMPLE_UNKNOWN = 1, SAMPLE_BAD_LENGTH = 2, SAMPLE_BAD_CONTENT = 3, SAMPLE_REFUSED, N_SAMPLE_KINDS };
 
 struct columns { /* of a slot: where they begin, bytes from its start */
@@ -163,7 +164,7 @@ struct plan {
     const int64_t *first_group;   /* (n_patches,) */
     const uint8_t *is_prompt;     /* (n_groups,) bool: in every period, so that frames wait for it */
     const int64_t *age_limit_ns;  /* (n_groups,) */
-    int64_t *last_sequence;       /* (n_modules,) */
+    int64_t *last_sequence;       /* (n_modules, N_OF_SEQUENCE) */
     uint8_t *module_flags;        /* (n_modules,) status that frames of others set; NULL: no frame does */
     int64_t *haste;               /* (n_patches,) */
     uint8_t *knows_clock;         /* (n_patches,) bool: something is known of the device's clock */

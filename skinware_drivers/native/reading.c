@@ -326,17 +326,35 @@ void finish_updates(struct path *path, int64_t first)
     }
 }
 
-/* Compare the number in a frame with that of the module's frame before. */
-void compare_sequence(struct path *path, const struct number *sequence, int64_t row)
+/* Compare the number in a frame with those of its module before; whether another frame has overtaken it. One whose number
+ * has come already is taken for that, too, unless the next one follows it: then the device has begun to count again. */
+bool is_overtaken(struct path *path, const struct number *sequence, int64_t row)
 {
     const struct plan *plan = path->plan;
     int64_t module = path->entry[row], number = read_number(payload_of(path->batch, row), sequence);
-    int64_t before = plan->last_sequence[module];
-    int64_t step = before == -1 ? 1 : floor_mod((int64_t)((uint64_t)number - (uint64_t)before), sequence->turn);
-    int64_t *counters = plan->patch_counters + plan->module_patch[module] * N_PATCH_COUNTERS;
-    bool is_back = step > sequence->turn / 2;
-    plan->last_sequence[module] = number;
+    int64_t *last = plan->last_sequence + N_OF_SEQUENCE * module, turn = sequence->turn;
+    int64_t step = last[NEWEST] == -1 ? 1 : floor_mod((int64_t)((uint64_t)number - (uint64_t)last[NEWEST]), turn);
+    int64_t *counters = plan->patch_counters + plan->module_patch[module] * N_PATCH_COUNTERS, back = turn - step;
+    uint64_t came = (uint64_t)last[CAME];
+    bool is_back = step > turn / 2, is_near = is_back && back <= 64 && turn > 2 * 64; /* small ones turn in a loss */
+    counters[SEQUENCE_BACK] += is_back;
+    if (is_near && !(came >> (back - 1) & 1)) {
+        counters[SEQUENCE_LOST]--;
+        last[CAME] = (int64_t)(came | UINT64_C(1) << (back - 1));
+        return true;
+    }
+    if (is_near && last[LEFT_OUT] != floor_mod(number - 1, turn)) {
+        last[LEFT_OUT] = number;
+        return true;
+    }
     counters[SEQUENCE_LOST] += is_back || step < 2 ? 0 : step - 1;
     counters[SEQUENCE_REPEATED] += step == 0;
-    counters[SEQUENCE_BACK] += is_back;
+    if (is_back)
+        came = UINT64_MAX; /* nothing is awaited of before */
+    else if (step)
+        came = step > 64 ? 0 : (came << 1 | 1) << (step - 1);
+    last[NEWEST] = number;
+    last[CAME] = (int64_t)came;
+    last[LEFT_OUT] = -1;
+    return false;
 }

@@ -31,6 +31,7 @@ from skinware.ros2.rmw_zenoh import ROUTER, MessageAttachment, gid, graph_endpoi
 _TOKEN_PARTS, _MOST_TOKENS = 13, 8192
 _AT_ONCE = 64
 """Samples in one read."""
+_OVERTAKEN = 64
 
 
 class ZenohOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -148,8 +149,11 @@ class ZenohPort(TopicPort):
                 self.refused += 1
             elif self.is_read(name, number, attachment.gid, time_ns):
                 publisher, before = self._sequences.get(name, (b"", 0))
-                if publisher == attachment.gid:
-                    self.dropped += max(0, attachment.sequence - before - 1)
+                step = attachment.sequence - before if publisher == attachment.gid else 1
+                if -_OVERTAKEN <= step < 0:
+                    self.refused += 1
+                    continue
+                self.dropped += max(0, step - 1)
                 self._sequences[name] = attachment.gid, attachment.sequence
                 records.append(record(number, attachment.time_ns, sample))
         if self._samples:

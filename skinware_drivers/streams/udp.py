@@ -1,7 +1,7 @@
 """Datagrams as a bus: each is a frame, or holds frames that a framing of serial lines finds.
 
 Only one other end is heard, which its address identifies. The network may lose and reorder datagrams; where a protocol
-numbers its frames and the layout says so, missing ones are counted.
+numbers its frames and the layout says so, missing ones are counted, and overtaken ones are not shown.
 """
 
 from __future__ import annotations

@@ -147,12 +147,12 @@ def test_sequence_numbers_are_compared_for_each_module_whatever_comes_between() 
                 ]
             )
         assert counted(pair) == {
-            "updates": 11,
+            "updates": 10,
             "sequence_lost": 2 + 7,
-            "sequence_repeated": 1,
+            "sequence_repeated": 2,
             "sequence_back": 1,
         }
-        assert pair.native.decoder.last_sequence.tolist() == [5, 3, 7]
+        assert pair.native.decoder.last_sequence[:, 0].tolist() == [5, 3, 7]
 
 
 # -- cycles --------------------------------------------------------------------------------------------------------
@@ -181,8 +181,8 @@ def test_each_member_of_a_cycle_may_have_its_counter_in_another_place() -> None:
         return bytes([wrong, 1, 2, number, 0, 9, number, 0] if place else [number, 1, 2, wrong, 1, 9, number, 0])
 
     with decoding(layout, skin(modules)) as (pair, begin_ns):
-        frames = [(place, key, number) for number in (1, 2, 255, 0) for key in range(2) for place in range(2)]
-        frames[5] = (1, 0, 3)  # in the place of the second half of 2, of module 0
+        frames = [(place, key, number) for number in (253, 254, 255, 0) for key in range(2) for place in range(2)]
+        frames[5] = (1, 0, 3)  # in the place of the second half of 254, of module 0
         pair.feed(
             [
                 (0, begin_ns + at, 0x100 | place << 4 | key, payload(place, number))

@@ -24,6 +24,8 @@ from tests.specification.device_time import DeviceStamps
 from tests.specification.pairing import Pairing
 from tests.specification.reading import name_modules, read_updates
 
+_LOST, _REPEATED, _BACK = (PATCH_COUNTERS.index(f"sequence_{what}") for what in ("lost", "repeated", "back"))
+_WINDOW = 64
 _EARLIEST_NS = 1
 """CLOCK_MONOTONIC begins with the machine, and 0 means never."""
 
@@ -142,6 +144,7 @@ class SpecifiedDecoder(Decoder):
         first, last = batch.start, batch.stop
         bus, payload = batch.bus[first:last], batch.wire["payload"][first:last]
         entry, kind, wrong = self.name(batch)
+        self._leave_out_overtaken(entry, kind, payload)
         new = slice(max(0, batch.headroom - first), None)  # those before have their times from the batch before
         time_ns = batch.time_ns[first:last][new]
         self.device_stamps.apply(kind[new], entry[new], payload[new], time_ns)
@@ -155,7 +158,6 @@ class SpecifiedDecoder(Decoder):
             rows = np.flatnonzero((kind == number) & is_module)
             if len(rows):
                 parts.append(self._read(assembly, batch, rows[:, None], entry[rows]))
-                self._compare(self.compiled.frames[number].sequence, payload[rows], entry[rows])
         severed = np.zeros(len(bus), bool)
         if interrupted:
             severed[: new.start] = np.isin(bus[: new.start], interrupted)
@@ -303,7 +305,10 @@ class SpecifiedDecoder(Decoder):
         self._count_haste(entry[pairs.soon], module[whole])
         if cycle.sequence is not None:
             member, sequence = cycle.sequence
-            self._compare(sequence, wire["payload"][pairs.rows[whole, member]], module[whole])
+            shown = ~whole
+            shown[whole] = ~self._overtaken(sequence, wire["payload"][pairs.rows[whole, member]], module[whole])
+            module, whole = module[shown], whole[shown]
+            return [self._read(cycle.assembly, batch, pairs.rows[shown], module, whole)] if len(module) else []
         return [self._read(cycle.assembly, batch, pairs.rows, module, whole)]
 
     def _count_haste(self, soon: Indices, whole: Indices) -> None:
@@ -365,35 +370,47 @@ class SpecifiedDecoder(Decoder):
         patch = self._module_patch[module]
         self.state.patch_counters[:, PATCH_COUNTERS.index(counter)] += np.bincount(patch, minlength=self._n_patches)
 
-    def _compare(self, sequence: SequenceNumber | None, payload: Bytes, module: Indices) -> None:
-        if sequence is not None and len(module):
-            first = PATCH_COUNTERS.index("sequence_lost")
-            for counter, found in enumerate(self._numbers(sequence, payload, module), start=first):
-                self.state.patch_counters[:, counter] += found
+    def _leave_out_overtaken(self, entry: Indices, kind: Bytes, payload: Bytes) -> None:
+        """Set the kind of frames that others have overtaken to 255; those of cycles are compared as a whole."""
+        for row in np.flatnonzero((entry < self._n_modules) & np.isin(kind, list(self.compiled.alone))).tolist():
+            rows = slice(row, row + 1)
+            if self._overtaken(self.compiled.frames[kind[row]].sequence, payload[rows], entry[rows]).any():
+                kind[row] = NO_KIND
 
-    def _numbers(self, sequence: SequenceNumber, payload: Bytes, module: Indices) -> tuple[Indices, Indices, Indices]:
-        """Compare the numbers of frames with those before them.
+    def _overtaken(self, sequence: SequenceNumber | None, payload: Bytes, module: Indices) -> Flags:
+        """Compare the numbers of frames, in order of arrival, with those of their module before, and count.
 
         Args:
             payload: (n, size) uint8.
             module: (n,) module of each.
 
         Returns:
-            For every patch, (n_patches,) each: how many numbers were skipped, were repeated, and went back.
+            (n,) which frames others have overtaken, or repeat an old number that none follows: they are not shown.
         """
-        order = np.argsort(module, kind="stable")
-        module, number = module[order], read_numbers(payload, sequence)[order]
-        before = np.empty_like(number)
-        before[1:] = number[:-1]
-        first = np.flatnonzero(np.append(True, module[1:] != module[:-1])) if len(module) else module
-        before[first] = self.last_sequence[module[first]]
-        step = (number - before) % sequence.turn
-        step[before == NONE_YET] = 1
-        self.last_sequence[module] = number
-        is_back = step > sequence.turn // 2
-        skipped = np.where(is_back, 0, np.maximum(step - 1, 0))
-        return self._by_patch(module, skipped), self._by_patch(module, step == 0), self._by_patch(module, is_back)
-
-    def _by_patch(self, module: Indices, count: Indices | npt.NDArray[np.bool_]) -> Indices:
-        found = np.bincount(self._module_patch[module], weights=count, minlength=self._n_patches)
-        return found.astype(np.int64)
+        found = np.zeros(len(module), bool)
+        if sequence is None:
+            return found
+        turn = sequence.turn
+        for at, (one, number) in enumerate(zip(module.tolist(), read_numbers(payload, sequence).tolist(), strict=True)):
+            newest, came, left_out = self.last_sequence[one].tolist()
+            step = 1 if newest == NONE_YET else (number - newest) % turn
+            back, counters = turn - step, self.state.patch_counters[self._module_patch[one]]
+            is_back = step > turn // 2
+            is_near = is_back and back <= _WINDOW and turn > 2 * _WINDOW
+            counters[_BACK] += is_back
+            if is_near and not came >> (back - 1) & 1:
+                counters[_LOST] -= 1
+                came, found[at] = came | 1 << (back - 1), True
+            elif is_near and left_out != (number - 1) % turn:
+                left_out, found[at] = number, True
+            else:
+                counters[_LOST] += 0 if is_back else max(step - 1, 0)
+                counters[_REPEATED] += step == 0
+                if is_back:
+                    came = -1
+                elif step:
+                    came = 0 if step > _WINDOW else (came << 1 | 1) << (step - 1)
+                newest, left_out = number, NONE_YET
+            came &= (1 << _WINDOW) - 1
+            self.last_sequence[one] = newest, came - (came >> (_WINDOW - 1) << _WINDOW), left_out
+        return found

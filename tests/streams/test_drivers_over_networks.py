@@ -6,8 +6,10 @@ import socket
 
 import pytest
 
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.status import BusState, PatchState
 from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.streams.udp import UdpPort
 from skinware_drivers.testing.driving import driving_lines, emulated_on, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual.hardware import load_emulator
@@ -32,6 +34,38 @@ def test_a_serial_driver_runs_unchanged(driver: str, scheme: str, namespace: obj
             [bus] = skin.driver.status()["buses"]
             assert bus["frames"] > 0
             assert bus["checksum_errors"] == 0
+
+
+def test_what_later_datagrams_overtook_is_not_shown_and_not_lost(
+    namespace: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send, data, late = UdpPort.write, list[bytes](), list[tuple[UdpPort, bytes]]()
+
+    def send_each_fifth_late(port: UdpPort, datagram: bytes) -> int:
+        data.append(datagram)
+        if len(datagram) > 1000 and len(data) % 5 == 0:
+            late.append((port, datagram))
+            return len(datagram)
+        sent = send(port, datagram)
+        if len(data) % 5 == 2 and late:
+            send(*late.pop())
+        return sent
+
+    monkeypatch.setattr(UdpPort, "write", send_each_fifth_late)
+    port = free_port(socket.SOCK_DGRAM)
+    bus = make_bus(f"udp://:{port}", payload_size=4096, for_devices=True)
+    with emulated_on(bus, load_emulator("wuji_glove"), pattern="cycle"):
+        with emulated_skin("wuji_glove", bus=f"udp://{LOCAL}:{port}") as skin:
+            shown = [(0, 0.0)]
+
+            def has_overtaken_enough(frame: DriverSnapshot) -> bool:
+                shown.append((int(frame.module_time_ns[0]), float(frame.values[0])))
+                return skin.reader.patch_counters(frame)[0]["sequence_back"] >= 20
+
+            counts = skin.reader.patch_counters(read_until(skin.reader, has_overtaken_enough))[0]
+    assert shown == sorted(shown)
+    assert counts["sequence_lost"] <= 1  # one may be on its way
+    assert counts["sequence_repeated"] == 0
 
 
 def test_a_device_that_hangs_up_is_called_again_and_again(namespace: object) -> None:

@@ -10,13 +10,12 @@ Once a second, and whenever the link comes or goes::
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import msgspec
 import numpy as np
-import numpy.typing as npt
 
-from skinware._columns import texts
 from skinware.errors import BadServiceFile
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
@@ -30,39 +29,8 @@ RATE_HZ = 1.0
 """How often it is published at least."""
 MOST = 64
 """Number of services that a state lists at most."""
-STATES = ("unheard", "live", "paused", "closed", "dead")
-"""States of services: as on the robot, or not heard."""
-MODES = ("pull", "push")
-
-_ROW = np.dtype(
-    [
-        ("name", "S48"),
-        ("state", "u1"),
-        ("mode", "u1"),
-        ("reserved", "u1", (6,)),
-        ("gap", "<u8"),
-        ("rate_hz", "<f8"),
-        ("gap_hz", "<f8"),
-        ("bytes_per_s", "<f8"),
-        ("age_p50_ns", "<f8"),
-        ("age_p99_ns", "<f8"),
-    ]
-)
-_COLUMNS = {
-    "is_up": Column(np.dtype("u1"), (), "", "the robot's bridge is heard"),
-    "since_ns": Column(np.dtype("<i8"), (), "ns", "since when, CLOCK_MONOTONIC"),
-    "clock_offset_ns": Column(np.dtype("<i8"), (), "ns", "our clock minus the robot's"),
-    "clock_error_ns": Column(np.dtype("<i8"), (), "ns", "what that may be wrong by; -1: nothing is known"),
-    "round_trip_ns": Column(np.dtype("<i8"), (), "ns", "the shortest lately"),
-    "instance": Column(np.dtype("S16"), (), "", "number of the bridge that is followed"),
-    "host": Column(np.dtype("S64"), (), "", "name of its machine"),
-    "namesakes": Column(np.dtype("<u4"), (), "", "other bridges that serve a robot of this name"),
-    "switches": Column(np.dtype("<u4"), (), "", "how often another robot of this name took the place of the first"),
-    "refused": Column(np.dtype("<u8"), (), "", "messages of the robot that could not be read"),
-    "last_refused": Column(np.dtype("S160"), (), "", "the last of those, and what was wrong"),
-    "count": Column(np.dtype("<u4"), (), "", "rows of services that are in use"),
-    "services": Column(_ROW, (MOST,), "", "each service: frames of the last second, ages from there to here"),
-}
+_STATE = Column(np.dtype("S40960"), (), "", "JSON, with the attributes of BridgeState")
+_LONGEST_NAME, _LONGEST_REASON = 64, 160
 
 
 @dataclass(frozen=True)
@@ -70,8 +38,8 @@ class ServiceState:
     """State of one service that comes over a bridge.
 
     Attributes:
-        state: one of ``STATES``.
-        mode: one of ``MODES``.
+        state: as on the robot (live, paused, closed, dead), or ``unheard``.
+        mode: ``pull`` or ``push``.
         rate_hz, gap_hz: samples of the last second that were published here, and that the robot published and that did
             not come.
         gap: samples that the robot published and that did not come, since the first one.
@@ -130,37 +98,7 @@ class BridgeSample(Sample):
 
     @property
     def state(self) -> BridgeState:
-        error_ns = int(self.column("clock_error_ns"))
-        is_known = error_ns >= 0
-        services = {}
-        for row in self.column("services")[: int(self.column("count"))]:
-            state, mode = int(row["state"]), int(row["mode"])
-            p50_ns, p99_ns = (None if np.isnan(row[age]) else float(row[age]) for age in ("age_p50_ns", "age_p99_ns"))
-            services[row["name"].decode(errors="replace")] = ServiceState(
-                STATES[state] if state < len(STATES) else STATES[0],
-                MODES[mode] if mode < len(MODES) else MODES[0],
-                float(row["rate_hz"]),
-                int(row["gap"]),
-                float(row["bytes_per_s"]),
-                p50_ns,
-                p99_ns,
-                float(row["gap_hz"]),
-            )
-        return BridgeState(
-            str(self.context),
-            bool(self.column("is_up")),
-            int(self.column("since_ns")),
-            int(self.column("clock_offset_ns")) if is_known else None,
-            error_ns if is_known else None,
-            int(self.column("round_trip_ns")),
-            services,
-            instance=_text(self.column("instance")),
-            host=_text(self.column("host")),
-            namesakes=int(self.column("namesakes")),
-            switches=int(self.column("switches")),
-            refused=int(self.column("refused")),
-            last_refused=_text(self.column("last_refused")),
-        )
+        return msgspec.json.decode(bytes(self.column("state").item()), type=BridgeState)
 
 
 class BridgeReader(ServiceReader[BridgeSample]):
@@ -176,14 +114,11 @@ class BridgeReader(ServiceReader[BridgeSample]):
 
     frame_class = BridgeSample
 
-    def _describe(self, attached: segments.Segment) -> str:
-        columns = attached.schema.columns
-        if bytes(attached.header["kind"]) != KIND.encode() or any(
-            name not in columns or (columns[name].dtype, columns[name].shape) != (column.dtype, column.shape)
-            for name, column in _COLUMNS.items()
-        ):
+    def _describe(self, attached: segments.Segment) -> None:
+        column = attached.schema.columns.get("state")
+        is_bridge = bytes(attached.header["kind"]) == KIND.encode()
+        if not is_bridge or column is None or (column.dtype, column.shape) != (_STATE.dtype, _STATE.shape):
             raise BadServiceFile(f"service {self.name!r} is no state of a bridge")
-        return (texts(attached.static_columns().get("robot", np.zeros(0, "S1"))) or [""])[0]
 
 
 class BridgeStateWriter(ServiceWriter):
@@ -192,8 +127,7 @@ class BridgeStateWriter(ServiceWriter):
     def __init__(self, robot: str, namespace: Namespace) -> None:
         super().__init__(
             service_name(robot),
-            _COLUMNS,
-            {"robot": np.array([robot.encode()], "S48")},
+            {"state": _STATE},
             namespace=namespace,
             kind=KIND,
             rate_hz=RATE_HZ,
@@ -206,28 +140,14 @@ class BridgeStateWriter(ServiceWriter):
         Raises:
             Closed, NameInUse: as :meth:`skinware.service.ServiceWriter.begin`.
         """
-        columns = self.begin()
-        columns["is_up"][...], columns["since_ns"][...] = state.is_up, state.since_ns
-        columns["clock_offset_ns"][...] = state.clock_offset_ns or 0
-        columns["clock_error_ns"][...] = -1 if state.clock_error_ns is None else state.clock_error_ns
-        columns["round_trip_ns"][...] = state.round_trip_ns
-        for name in ("namesakes", "switches", "refused"):
-            columns[name][...] = getattr(state, name)
-        for name in ("instance", "host", "last_refused"):
-            columns[name][...] = getattr(state, name).encode(errors="replace")
-        told = list(state.services.items())[:MOST]
-        columns["count"][...] = len(told)
-        columns["services"][:] = np.zeros(MOST, _ROW)
-        for row, (name, service) in enumerate(told):
-            ages = (np.nan if age is None else age for age in (service.age_p50_ns, service.age_p99_ns))
-            enums = STATES.index(service.state), MODES.index(service.mode), 0
-            rates = service.rate_hz, service.gap_hz, service.bytes_per_s
-            columns["services"][row] = (name.encode(), *enums, service.gap, *rates, *ages)
+        state = replace(
+            state,
+            services=dict(list(state.services.items())[:MOST]),
+            host=state.host[:_LONGEST_NAME],
+            last_refused=state.last_refused[:_LONGEST_REASON],
+        )
+        self.begin()["state"][...] = msgspec.json.encode(state)
         self.commit(at_ns)
-
-
-def _text(column: npt.NDArray[Any]) -> str:
-    return bytes(column.item()).decode(errors="replace")
 
 
 _TITLES = ("service", "state", "mode", "rate", "age 50 %", "age 99 %", "not come")

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import signal
 import time
+from collections.abc import Collection
 from typing import ClassVar
 
 import numpy as np
@@ -44,7 +45,7 @@ _FIXED = ("head", "title", "marks", "detail")
 _LINES = ("head", "why", "title", "scale", "contacts", "marks", "detail")
 _ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _NOTHING = """\
-No driver runs in namespace {name!r} now.
+No{what}.
 
 Start one in another terminal, for example:
 
@@ -178,6 +179,7 @@ class SkinTop(App[None]):
     def __init__(
         self,
         namespace: Namespace,
+        names: Collection[str] = (),
         type_name: str | None = None,
         duration_s: float | None = None,
         *,
@@ -188,7 +190,7 @@ class SkinTop(App[None]):
     ) -> None:
         super().__init__()
         palette = palette or palette_for(self.console.color_system, no_color=self.no_color)
-        self._overview = Overview(namespace)
+        self._overview = Overview(namespace, names)
         self._duration_s = duration_s
         self._picture = Picture(type_name, scale_name, palette, regions=regions, region=region)
         self._list = DriverList(id="list")
@@ -315,7 +317,7 @@ class SkinTop(App[None]):
             return  # the screen is being taken down
         namespace = self._overview.drivers.namespace.name
         rows: list[ListRow] = []
-        why = _NOTHING.format(name=namespace)
+        why = ""
         heading = ["skin-top", f"namespace {namespace}"]
         try:
             drivers = self._overview.look()
@@ -327,6 +329,8 @@ class SkinTop(App[None]):
             if self._is_worst_first:
                 reports.sort(key=lambda report: -report.worst)
             rows = [row for report in reports for row in rows_of(report, worst_first=self._is_worst_first)]
+            if not drivers:
+                why = _NOTHING.format(what=self._overview.nothing.removeprefix("no"))
             heading += [plural(len(drivers), "driver")]
             heading += [summary(bridge.robot, as_data(bridge)) for bridge in self._overview.bridges.states()]
         except NamespaceError as error:

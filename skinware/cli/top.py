@@ -30,10 +30,12 @@ _NEEDED = "textual>=8"
 @cli.command(
     "skin-top",
     "skin-top                    in the terminal",
+    "skin-top torso              one driver of several",
     "skin-top --type proximity   draw another type of sensors",
     "skin-top --region palm      draw a region of regions.toml",
     "skin-top --plain -T 10      ten seconds of plain lines",
 )
+@cli.names_argument
 @click.option(
     "--plain", is_flag=True, help="Print one line per second for each driver; the default without a terminal."
 )
@@ -53,6 +55,7 @@ _NEEDED = "textual>=8"
 @click.pass_context
 def command(
     context: click.Context,
+    names: tuple[str, ...],
     plain: bool,
     duration_s: float | None,
     type_name: str | None,
@@ -62,32 +65,36 @@ def command(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Show all drivers live: states, rates, ages, losses, and a picture of the skin.
+    """Show drivers live, all or those with NAME: states, rates, ages, losses, and a picture of the skin.
 
     Contacts are shown too where a service publishes them, as skin-calm does.
     """
-    from skinware.memory.namespace import Namespace
+    from skinware.memory.namespace import Namespace, check_name
 
+    for name in names:
+        check_name(name, "driver")
     if plain or as_json:
-        cli.refuse_others("--plain" if plain else "--json", {"plain", "as_json", "duration_s", "namespace"})
+        cli.refuse_others("--plain" if plain else "--json", {"names", "plain", "as_json", "duration_s", "namespace"})
     place = Namespace(namespace)
-    names = () if region is None else (region,)
-    regions = cli.regions_of(region_files, names) if names or region_files else None
+    wanted = () if region is None else (region,)
+    regions = cli.regions_of(region_files, wanted) if wanted or region_files else None
     if not plain and not as_json and are_terminals(sys.stdin, sys.stdout, sys.stderr):  # Textual draws on stderr
         if find_spec("textual") is not None:
             from skinware.cli._top_app import SkinTop
 
-            app = SkinTop(place, type_name, duration_s, scale_name=scale_name, regions=regions, region=region)
+            app = SkinTop(place, names, type_name, duration_s, scale_name=scale_name, regions=regions, region=region)
             app.run()
             context.exit(app.return_code or 0)
         cli.warn(f"for the live view: {sys.executable} -m pip install '{_NEEDED}'. Going on with plain lines")
-    show_lines(place, duration_s, as_json)
+    show_lines(place, duration_s, as_json, names)
 
 
-def show_lines(namespace: Namespace, duration_s: float | None, as_json: bool = False) -> None:
+def show_lines(
+    namespace: Namespace, duration_s: float | None, as_json: bool = False, names: Sequence[str] = ()
+) -> None:
     from skinware.views.live import Overview
 
-    overview = Overview(namespace)
+    overview = Overview(namespace, names)
     lines_at_s = time.monotonic()
     end_s = math.inf if duration_s is None else lines_at_s + duration_s
     try:
@@ -118,7 +125,7 @@ def _print_lines(overview: Overview, drivers: Sequence[LiveDriver], as_json: boo
     if as_json:
         return
     if not drivers:
-        echo(f"no driver runs in namespace {overview.drivers.namespace.name!r}; start one: skin-driver --bus virtual")
+        echo(f"{overview.nothing}; start one: skin-driver --bus virtual")
     for bridge in overview.bridges.states():
         echo(bridge_state.summary(bridge.robot, bridge_state.as_data(bridge)))
 

@@ -36,6 +36,7 @@ from skinware.structure import Structure
 from skinware.tactile.contacts import Contact
 from skinware.tactile.contacts_service import ContactsReader, ContactsSample
 from skinware.tactile.source_service import SourceReader
+from skinware.text import nearest_name
 
 _RATE_WINDOW_NS = 2 * NS_PER_S
 _COUNT_EVERY_NS = NS_PER_S // 10
@@ -240,10 +241,11 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
 
 
 class Overview:
-    """Everything that runs in a namespace: its drivers, the contacts on them, and its bridges."""
+    """The drivers of a namespace, all or those with some names, the contacts on them, and its bridges."""
 
-    def __init__(self, namespace: Namespace) -> None:
-        self.drivers = LiveDrivers(namespace)
+    def __init__(self, namespace: Namespace, names: Collection[str] = ()) -> None:
+        self.names = names
+        self.drivers = LiveDrivers(namespace, names)
         self.contacts = LiveSources[ContactsSample](namespace, ContactsReader)
         self.bridges = LiveBridges(namespace)
 
@@ -254,6 +256,15 @@ class Overview:
         self.contacts.look()
         self.bridges.look()
         return self.drivers.look()
+
+    @property
+    def nothing(self) -> str:
+        """The drivers that were looked for, and what else there is: where none of them runs."""
+        namespace = self.drivers.namespace
+        if not self.names:
+            return f"no driver runs in namespace {namespace.name!r}"
+        wanted = ", ".join(self.names)
+        return f"no driver {wanted} runs in namespace {namespace.name!r}{nearest_name(wanted, namespace.services())}"
 
     def contacts_on(self, driver: LiveDriver) -> list[TouchedPlace] | None:
         sample = self.contacts.of(driver.name)

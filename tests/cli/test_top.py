@@ -45,6 +45,17 @@ def test_nobody_runs(capsys: pytest.CaptureFixture[str], namespace: Namespace) -
     assert lines(capsys, "--json", "-T", "0.01") == []
 
 
+def test_drivers_that_are_named(capsys: pytest.CaptureFixture[str], namespace: Namespace) -> None:
+    with FakeSkin("arm"), FakeSkin("leg"), FakeSkin("torso"):
+        assert [line.split()[0] for line in lines(capsys, "torso", "arm", "-T", "0.01")] == ["arm", "torso"]
+        (missing,) = lines(capsys, "torzo", "-T", "0.01")
+    assert missing.startswith(
+        f"no driver torzo runs in namespace {namespace.name!r}; did you mean 'torso'? There are: arm"
+    )
+    assert exit_status(command, ["my skin"]) == 2
+    assert "name 'my skin'" in capsys.readouterr().err
+
+
 def test_json(capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("a", fake_structure(1, 2)) as skin:
         skin.publish(2)
@@ -65,7 +76,7 @@ def test_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "status"), [(["-T", "nan"], 2), (["--namespace", "a/b"], 2), (["--nonsense"], 2), (["name"], 2)]
+    ("arguments", "status"), [(["-T", "nan"], 2), (["--namespace", "a/b"], 2), (["--nonsense"], 2), (["a name"], 2)]
 )
 def test_mistakes(arguments: list[str], status: int, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(command, ["--plain", *arguments]) == status

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 
 import numpy as np
@@ -43,8 +43,11 @@ async def shown(
     duration_s: float | None = None,
     scale_name: str = CHANGE,
     regions: Regions | None = None,
+    names: Sequence[str] = (),
 ) -> AsyncIterator[tuple[SkinTop, Pilot[None]]]:
-    app = SkinTop(Namespace(), type_name, duration_s, palette=TRUE_COLOURS, scale_name=scale_name, regions=regions)
+    app = SkinTop(
+        Namespace(), names, type_name, duration_s, palette=TRUE_COLOURS, scale_name=scale_name, regions=regions
+    )
     async with app.run_test(size=size) as pilot:
         await pilot.pause()
         yield app, pilot
@@ -92,6 +95,18 @@ def go(scene: Callable[[], Awaitable[None]]) -> None:
 def look_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
     monkeypatch.setattr(_top_app, "_LIST_PERIOD_S", 0.1)
+
+
+def test_only_drivers_that_are_named_are_shown() -> None:
+    async def scene() -> None:
+        with publishing(FakeSkin("torso", fake_structure(1, 2))), publishing(FakeSkin("arm", fake_structure(1, 2))):
+            async with shown(names=["torso"]) as (app, pilot):
+                await until(pilot, lambda: listed(app) == ["torso live", "can0 live", "board 7 live"])
+            async with shown(names=["torzo"]) as (app, _):
+                assert "No driver torzo runs in namespace" in line(app, "why")
+                assert "did you mean 'torso'" in line(app, "why")
+
+    go(scene)
 
 
 def test_nobody_runs_then_somebody_does_then_nobody() -> None:

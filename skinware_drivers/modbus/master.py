@@ -194,7 +194,7 @@ class Master:
             found = self._line.reply_to(asked)
             if found is None:
                 break
-            self._take(found, time_ns)
+            self._take(found, time_ns, is_alone=len(asked) > 1 or not self._line.repeats(asked[0]))
         else:
             self._line.drop()  # no unit may speak unasked
         question = self.unanswered.open
@@ -207,13 +207,14 @@ class Master:
             elif question.read != PROBE and question.tries < _MOST_TRIES:
                 self._again = question
 
-    def _take(self, message: Message, time_ns: int) -> None:
+    def _take(self, message: Message, time_ns: int, *, is_alone: bool = True) -> None:
         line = self.unanswered
         asked = line.open
         if line.drains:
             self._counters.refused += 1
             return
-        answered = line.take(message, time_ns, is_numbered=isinstance(self._line, wire.TcpMessages))
+        is_numbered = isinstance(self._line, wire.TcpMessages)
+        answered = line.take(message, time_ns, is_numbered=is_numbered, is_alone=is_alone)
         if answered is None:
             if asked is None or (message.number, message.unit) != (asked.message.number, asked.message.unit):
                 self._counters.refused += 1

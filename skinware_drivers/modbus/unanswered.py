@@ -118,10 +118,11 @@ class Unanswered:
                 return probe
         return None
 
-    def take(self, reply: Message, time_ns: int, *, is_numbered: bool) -> Answered | None:
+    def take(self, reply: Message, time_ns: int, *, is_numbered: bool, is_alone: bool) -> Answered | None:
         """Return the question that a reply answers; None: it answers none.
 
         Args:
+            is_alone: no other reply came with it, of which one is old.
             is_numbered: a reply has the number of its question, but some servers, when two questions are open, answer
                 the first with the number of the second (pymodbus 3.16).
         """
@@ -144,7 +145,8 @@ class Unanswered:
         else:
             self._keep_pace(2 * (time_ns - question.until_ns))
         same = all(self._asked[n].message.data == question.message.data for n in fitting)
-        answered = Answered(question, self._asked[fitting[0]].asked_ns, same or bool(wire.exception_of(reply.data)))
+        is_sure = is_alone and (same or bool(wire.exception_of(reply.data)))
+        answered = Answered(question, self._asked[fitting[0]].asked_ns, is_sure)
         if answered.is_sure:
             del self._asked[: fitting[0] + 1]
         return answered

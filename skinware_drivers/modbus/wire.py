@@ -189,6 +189,10 @@ class RtuMessages(_Messages):
         """Return the reply to one of these questions, if it has arrived; bytes before it are skipped."""
         return self._first(asked, also_questions=False)
 
+    def repeats(self, asked: Message) -> bool:
+        """Return whether another reply to a question seems to follow the one that was found."""
+        return len(self._rest) > 2 and bool(_sizes_of_reply(self._rest, asked.unit, asked.data))
+
     def next_of(self, asked: Message | None) -> Message | None:
         """Return the next message on a line with another master: the reply to ``asked``, or a question."""
         return self._first([] if asked is None else [asked], also_questions=True)

@@ -87,9 +87,11 @@ class Line:
     Attributes:
         one, other, tap: their paths.
         from_tap: what the third has sent: nobody hears it.
+        disturb: what becomes of bytes that the other sends.
     """
 
     def __init__(self, ends: Sequence[tuple[int, int]]) -> None:
+        self.disturb: Callable[[bytes], bytes] = bytes
         self.one, self.other, self.tap = (os.ttyname(slave) for _, slave in ends)
         self.from_tap = b""
 
@@ -113,6 +115,7 @@ def line() -> Iterator[Line]:
             for fd in ready:
                 data = os.read(fd, 4096)
                 made.from_tap += data if fd == tap else b""
+                data = made.disturb(data) if fd == other else data
                 for hearer in hearers[fd]:
                     with contextlib.suppress(BlockingIOError):
                         os.write(hearer, data)

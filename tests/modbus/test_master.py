@@ -353,6 +353,27 @@ def test_what_nobody_asked_for_is_dropped() -> None:
     assert len(talk.registers(talk.next_question())) == 1
 
 
+@pytest.mark.parametrize("arrived", [3, 8, 13])
+def test_of_two_replies_to_one_question_none_is_shown(arrived: int) -> None:
+    """One of them is old; the second has come in part, or as a whole."""
+    talk = Conversation(*ONE)
+    question = talk.next_question()
+    old, present = (wire.rtu_frame(Message(1, reply_of(range(first, first + 4)))) for first in (0, 50))
+    talk.hear(old + present[:arrived])
+    talk.hear(present[arrived:])
+    assert talk.rows() == []
+    assert talk.counters.refused == 1
+    assert talk.next_question() == question
+    assert [row.payload[1] for row in talk.registers(question, 51)] == [51]
+
+
+def test_a_byte_of_noise_behind_a_reply_costs_nothing() -> None:
+    talk = Conversation(*ONE)
+    talk.next_question()
+    talk.hear(wire.rtu_frame(Message(1, reply_of(range(4)))) + b"\x01\x03")
+    assert len(talk.rows()) == 1
+
+
 # Exceptions
 
 

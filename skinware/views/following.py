@@ -26,6 +26,7 @@ from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
 _JUDGE_EVERY_NS = NS_PER_S // 5
+_LOOK_EVERY_NS = NS_PER_S // 10
 _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _EARLY_NS = 5_000_000
@@ -186,7 +187,8 @@ class ShownDriver:
         self.past.add(frame.values, frame.published_ns)
         at_ns = None if self.origin.recording is None else frame.published_ns  # it may have been paused meanwhile
         self.newest = self._judged(frame, status_now(LIVE, frame, at_ns), is_newer=True)
-        self.rest.follow(self.newest.all_physical(), self.newest.status == 0, frame.published_ns)
+        if self.rest.is_due(frame.published_ns):
+            self.rest.follow(self.newest.all_physical(), self.newest.status == 0, frame.published_ns)
         self.changes += 1
 
     def judge(self) -> None:
@@ -237,7 +239,7 @@ class Follower:
         self.origins = origins
         self.drivers: list[ShownDriver] = []
         self.problem: str | None = None
-        self.edition = 0
+        self.edition = self._look_ns = 0
         self.functions: dict[str, PlotFunction] = {}
         self.robot = robot or Robot()
         self.scene = Scene({}, self.robot.poses)
@@ -256,22 +258,14 @@ class Follower:
         Returns:
             The drivers with a newer snapshot; their ``changes``, and ``edition``, show what else has changed.
         """
-        self.problem = None
-        try:
-            found = [(live, origin) for origin in self.origins for live in origin.look()]
-        except NamespaceError as error:
-            self.problem = str(error)
+        if now_ns() >= self._look_ns:
+            self._look_ns, self.problem = now_ns() + _LOOK_EVERY_NS, None
+            try:
+                self._look()
+            except NamespaceError as error:
+                self.problem = str(error)
+        if self.problem is not None:
             return []
-        if [driver.live for driver in self.drivers] != [live for live, _ in found]:
-            kept = {id(driver.live): driver for driver in self.drivers}
-            gone, self.drivers = self.drivers, []
-            for live, origin in found:
-                number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
-                self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
-            for driver in gone:
-                if driver not in self.drivers:
-                    driver.close()
-            self._arrange()
         generations = [driver.generation for driver in self.drivers]
         newer = [driver for driver in self.drivers if self._take(driver, period_ns)]
         if generations != [driver.generation for driver in self.drivers]:
@@ -284,6 +278,20 @@ class Follower:
         for origin in self.origins:
             origin.close()
         self.drivers = []
+
+    def _look(self) -> None:
+        """Look for drivers that came or went."""
+        found = [(live, origin) for origin in self.origins for live in origin.look()]
+        if [driver.live for driver in self.drivers] != [live for live, _ in found]:
+            kept = {id(driver.live): driver for driver in self.drivers}
+            gone, self.drivers = self.drivers, []
+            for live, origin in found:
+                number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
+                self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
+            for driver in gone:
+                if driver not in self.drivers:
+                    driver.close()
+            self._arrange()
 
     def _take(self, driver: ShownDriver, period_ns: int) -> bool:
         if now_ns() - driver.taken_ns < period_ns - _EARLY_NS:

@@ -63,6 +63,10 @@ class DriverRest:
         self._time_ns: int | None = None
         self._every_ns = 0
 
+    def is_due(self, time_ns: int) -> bool:
+        """Return whether a snapshot of this time changes anything."""
+        return self._time_ns is None or not 0 <= time_ns - self._time_ns < self._every_ns
+
     def follow(self, physical: Floats, fresh: npt.NDArray[np.bool_], time_ns: int) -> None:
         """Take a snapshot into account; the same one again changes nothing. At rest, ten a second are enough.
 
@@ -71,7 +75,7 @@ class DriverRest:
             fresh: (n,) bool; other sensors are left out.
             time_ns: when it was published, CLOCK_MONOTONIC.
         """
-        if self._time_ns is not None and 0 <= time_ns - self._time_ns < self._every_ns:
+        if not self.is_due(time_ns):
             return
         passed_s = np.float32(0 if self._time_ns is None else min(1.0, max(0, time_ns - self._time_ns) / 1e9))
         self._time_ns = time_ns

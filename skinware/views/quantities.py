@@ -286,7 +286,7 @@ class Newest:
         """(n_sensors,) bool: those whose baselines the calmed driver does not know yet."""
         return self.once("settling", lambda: settling(self.calm or self.frame))
 
-    @property
+    @cached_property
     def marked(self) -> npt.NDArray[np.uint8]:
         """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
         unseen = (self.status & _NEVER_SEEN) != 0

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import mimetypes
 import ssl
+import time
 from collections import deque
 from collections.abc import Callable
 from http import HTTPStatus
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
-from websockets.asyncio.server import ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
@@ -35,6 +36,8 @@ _TICK_S = 0.01
 _LONGEST_S = 0.04
 """Between two looks while there is news: plots want every snapshot, and the ring of a fast driver holds 64 of them."""
 _LONGEST_TURN_S = 0.5
+_EARLY_S = 0.005
+"""A turn may be sent this much earlier than the pace asks for."""
 _MOST_VIEWERS = 32
 _MOST_MARKS = 64
 _LONGEST_OPERATION = 1 << 16
@@ -78,9 +81,8 @@ class ViewServer:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
         self._live, self._files = Show(follower), files or RecordingFiles()
         self._doctor = doctor or DoctorProgram((), follower.namespace.name)
-        self._viewers: set[Viewer] = set()
+        self._viewers: dict[Viewer, ServerConnection] = {}
         self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
-        self._news = asyncio.Event()
         self._frames, self._tls = _NOTEBOOKS if is_framed else "'none'", tls
 
     async def show(self, host: str, port: int, ready: Callable[[int], object], stop: asyncio.Event) -> None:
@@ -123,7 +125,8 @@ class ViewServer:
             if pauses_s:
                 problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
                 self._doctor.follow([problem for problem in problems if NOTE not in problem])
-                self._wake()
+                for viewer in self._viewers:
+                    self._send_due(viewer)
             await asyncio.sleep(min(pauses_s, default=_TICK_S))
 
     def _take(self, show: Show) -> float:
@@ -180,55 +183,40 @@ class ViewServer:
         show = await asyncio.to_thread(self._files.open, recordings) if recordings else self._live
         show.follower.functions = self._follower.functions
         viewer = Viewer(show)
-        self._viewers.add(viewer)
+        self._viewers[viewer] = connection
         try:
             with contextlib.suppress(ConnectionClosed):
                 await self._serve(viewer, connection)
         finally:
-            self._viewers.discard(viewer)
+            del self._viewers[viewer]
             viewer.plots.close()
             if show is not self._live:
                 await asyncio.shield(asyncio.to_thread(show.close))
 
     async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
-        """Carry out the operations of a viewer, and send it a turn for each one that it asks for."""
-        wanted = asyncio.Semaphore(0)
-        sending = asyncio.create_task(self._send_turns(viewer, connection, wanted))
-        try:
-            async for text in connection:
-                try:
-                    operation = looks.operation_of(text)
-                    if isinstance(operation, looks.Next):
-                        wanted.release()
-                    self._do(viewer, operation)
-                except ConfigurationError as error:
-                    viewer.refuse(str(error))
-                self._wake()
-        finally:
-            sending.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await sending
+        """Carry out the operations of a viewer; it gets a turn for each one that it asks for."""
+        async for text in connection:
+            try:
+                self._do(viewer, looks.operation_of(text))
+            except ConfigurationError as error:
+                viewer.refuse(str(error))
+            self._send_due(viewer)
 
-    async def _send_turns(self, viewer: Viewer, connection: ServerConnection, wanted: asyncio.Semaphore) -> None:
-        loop = asyncio.get_running_loop()
-        last_s = 0.0
-        while True:
-            await wanted.acquire()
-            await asyncio.sleep(last_s + 1 / viewer.look.fps - loop.time())
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(_LONGEST_TURN_S):
-                    while not viewer.has_news:
-                        await self._news.wait()
-            last_s = loop.time()
-            await connection.send(viewer.turn(self._besides(viewer.show)))
-
-    def _wake(self) -> None:
-        self._news.set()
-        self._news.clear()
+    def _send_due(self, viewer: Viewer) -> None:
+        """Send a viewer its next turn if it waits for one, has taken the last one, and something is new."""
+        now_s, connection = time.monotonic(), self._viewers[viewer]
+        if not viewer.wanted or now_s < viewer.sent_s + 1 / viewer.look.fps - _EARLY_S:
+            return
+        if not viewer.has_news and now_s < viewer.sent_s + _LONGEST_TURN_S:
+            return
+        if not connection.transport.get_write_buffer_size():
+            viewer.wanted, viewer.sent_s = viewer.wanted - 1, now_s
+            broadcast([connection], viewer.turn(self._besides(viewer.show)))
 
     def _do(self, viewer: Viewer, operation: looks.Operation) -> None:
         match operation:
             case looks.Next():
+                viewer.wanted += 1
                 if operation.protocol not in (None, PROTOCOL):
                     raise ConfigurationError(f"this server speaks {PROTOCOL}: reload the page")
             case looks.Mark() if viewer.show.is_live:

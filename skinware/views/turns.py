@@ -30,6 +30,8 @@ from skinware.views.tree import problem_of_all, problems_of, state_of, worst_fir
 PROTOCOL = "skinware.view.2"
 _ALIGNMENT = 8
 _STATE_EVERY_NS = NS_PER_S // 2
+_EXACT_EVERY_NS = NS_PER_S // 10
+"""People read no more numbers."""
 _MOST_QUESTIONS = 64
 
 
@@ -62,16 +64,21 @@ class _Got:
 
 
 class Viewer:
-    """One viewer of a show: its look, its questions, and what it has got so far."""
+    """One viewer of a show: its look, its questions, and what it has got so far.
+
+    Attributes:
+        wanted: turns that it has asked for, and waits for.
+        sent_s: when it got its last turn, CLOCK_MONOTONIC.
+    """
 
     def __init__(self, show: Show) -> None:
-        self.look = looks.Look()
+        self.look, self.wanted, self.sent_s = looks.Look(), 0, 0.0
         self.show, self._follower = show, show.follower
         self._sent: dict[str, Any] = {}  # of the replays
         self._number = 0
         self._edition = -1
         self._got: defaultdict[int, _Got] = defaultdict(_Got)  # by the driver's number
-        self._state_due_ns = 0
+        self._state_due_ns = self._exact_due_ns = 0
         self._lives: list[str] = []
         self._exact: list[tuple[int, int]] = []
         self._asked = False
@@ -141,9 +148,9 @@ class Viewer:
                 pictures += [shown] if shown is not None else []
         if pictures:
             header |= {"pictures": pictures, "mode": self.look.mode}
-        if self._exact:
+        if self._asked or (self._exact and now_ns() >= self._exact_due_ns):
+            self._asked, self._exact_due_ns = False, now_ns() + _EXACT_EVERY_NS
             header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
-        self._asked = False
         if self._questions:
             header |= self._answer(self._questions.pop(0))
         blocks = self.plots.blocks()

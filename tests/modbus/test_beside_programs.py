@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
-from skinware import DriverReader
+from skinware import DriverReader, DriverSnapshot
 from skinware_drivers.modbus.adapter import ModbusAdapter
+from skinware_drivers.modbus.dfrobot import DfrobotDriver, DfrobotOptions
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
 from skinware_drivers.modbus.revo2 import Revo2Driver, Revo2Options
 from skinware_drivers.modbus.revo3 import Revo3Driver, Revo3Options
 from skinware_drivers.modbus.wire import READ_INPUT
 from skinware_drivers.testing.waiting import read_until
+from tests.modbus import test_dfrobot as dfrobot
 from tests.modbus import test_inspire as inspire
 from tests.modbus import test_revo2 as revo2
 from tests.modbus import test_revo3 as revo3
@@ -78,6 +80,14 @@ HANDS = {
         [(READ_INPUT, begin, n) for begin, n in zip(revo3.BEGINS, revo3.POINTS, strict=True)],
         5100,
     ),
+    "dfrobot": Hand(
+        lambda: DfrobotDriver(DfrobotOptions(shapes=("6x6",))),
+        lambda: dfrobot.array(1, range(101, 137), model=1),
+        1,
+        np.arange(101, 137).reshape(6, 6)[::-1].ravel().tolist(),
+        [(READ_INPUT, 7, 36)],
+        2,
+    ),
 }
 
 
@@ -111,6 +121,30 @@ def test_a_program_moves_the_hand_through_the_gateway(hand: Hand, tmp_path: Path
                     told = program.read_holding_registers(hand.moves, count=1, device_id=hand.unit)
                     assert told.registers == [angle]
             until_right(reader, hand)
+
+
+def test_nothing_wrong_is_shown_from_a_line_that_loses_damages_and_repeats(hand: Hand) -> None:
+    """Of thirteen replies one is lost, one damaged, and one comes behind the reply before, if they have one length."""
+    replies = list[bytes]()
+
+    def disturb(reply: bytes) -> bytes:
+        replies.append(reply)
+        before, turn = replies[max(0, len(replies) - 2)], len(replies) % 13
+        if turn == 4 and len(before) == len(reply) > 30:
+            return before + reply
+        return b"" if turn == 8 else reply[:-1] + bytes([reply[-1] ^ 1]) if turn == 0 else reply
+
+    def has_seen_enough(frame: DriverSnapshot) -> bool:
+        assert np.array_equal(frame.values, hand.right)
+        counts = counted(driving)
+        return counts["refused"] and min(counts["polls_unanswered"], counts["checksum_errors"]) >= 3
+
+    with line() as between, rtu_server_on(between.other, hand.server(), baudrate=BAUDRATE):
+        name = f"modbus:{between.one}?baudrate={BAUDRATE}&timeout_ms=100"
+        with driven(name, hand.adapter()) as (driving, reader):
+            until_right(reader, hand)
+            between.disturb = disturb
+            read_until(reader, has_seen_enough)
 
 
 def test_a_program_moves_the_hand_over_a_connection_of_its_own() -> None:

@@ -199,24 +199,6 @@ def test_a_server_that_answers_late_never_shifts_values(way: str) -> None:
             assert (frame.values[fresh] == right[fresh]).all()
 
 
-def test_an_old_reply_before_the_present_one_is_not_shown() -> None:
-    """Two of the three reads have replies of one length: the one of the first reply comes before that of the second."""
-    replies = list[bytes]()
-
-    def disturb(data: bytes) -> bytes:
-        replies.append(data)
-        is_second = replies[-2:-1] and len(data) == len(replies[-2]) > 200 and len(replies) > 20
-        return replies[-2] + data if is_second and len(replies) % 5 == 0 else data
-
-    with line() as between, rtu_server_on(between.other, palm()):
-        with driven(f"modbus:{between.one}?timeout_ms=300") as (driving, reader):
-            until_right(reader)
-            between.disturb = disturb
-            right = np.arange(1000, 1000 + N)
-            frame = read_until(reader, lambda frame: (frame.values != right).any() or counted(driving)["refused"] >= 3)
-            assert (frame.values == right).all()
-
-
 def test_two_programs_on_one_server() -> None:
     with tcp_server(palm()) as name, driven(name) as (driving, reader):
         host, port = name.removeprefix("modbus:tcp://").split(":")

@@ -113,6 +113,18 @@ static bool stands_still(const struct device_clock *clock)
            above_ns(clock, &clock->points[clock->n_points - 2]) - clock->offset_ns > FAR_BEHIND_NS;
 }
 
+/* Whether a clock that stood still has gone at half its speed, at least, for a part. */
+static bool goes_again(struct device_clock *clock, int64_t stamp, int64_t received_ns)
+{
+    double gone_ns = (double)step_to(clock, stamp, received_ns) * clock->unit_ns;
+    if (received_ns - clock->received_ns < clock->part_ns)
+        return false;
+    clock->is_still = 2 * gone_ns < (double)(received_ns - clock->received_ns);
+    clock->received_ns = received_ns;
+    clock->stamp = clock->is_still ? stamp : -1;
+    return !clock->is_still;
+}
+
 /* When a frame was stamped, CLOCK_MONOTONIC ns: never after its receipt, and never before the frame before.
  *
  * A gap in the stream, or the delay of a frame, may be as long as half the time in which the stamps wrap around. After a
@@ -121,6 +133,8 @@ static bool stands_still(const struct device_clock *clock)
  */
 static int64_t convert(struct device_clock *clock, int64_t stamp, int64_t received_ns)
 {
+    if (clock->is_still && !goes_again(clock, stamp, received_ns))
+        return clock->last_ns = received_ns;
     if (clock->stamp < 0)
         begin(clock, stamp, received_ns);
     int64_t step = step_to(clock, stamp, received_ns);
@@ -144,7 +158,7 @@ static int64_t convert(struct device_clock *clock, int64_t stamp, int64_t receiv
         time_ns = received_ns;
     if (stands_still(clock)) {
         clock->stops++;
-        clock->stamp = -1; /* the next one begins again */
+        clock->is_still = 1;
         time_ns = received_ns;
     }
     clock->last_ns = time_ns;

@@ -38,7 +38,7 @@ struct device_clock { /* stamp: the last one, -1: the next one begins; drift, of
     double unit_ns, drift, offset_ns;
     int64_t modulo, part_ns, jump_ns; /* a part has one point; a stamp so far in the future: the clock was set */
     struct clock_point *points;       /* (CLOCK_PARTS,) the frame of least delay of each part, oldest first */
-    int64_t n_points, origin_ns, ticks, stamp, received_ns, last_ns, restarts, stops;
+    int64_t n_points, origin_ns, ticks, stamp, received_ns, last_ns, restarts, stops, is_still;
 };
 
 struct chain { /* the last element of every key so far, forgotten all at once */

@@ -138,12 +138,12 @@ def test_a_stop_is_named_once_and_a_patch_is_forgotten(namespace: Namespace, cap
         begin_ns = clock.now_ns + S
         for number in range(8):
             send(begin_ns + number * S, 0)
-        state, late_ns = pair.native.decoder.state, begin_ns + 7 * S + 900 * MS
-        send(begin_ns + 7 * S + 100 * MS, 100)
-        send(late_ns, 200)
+        state, late_ns = pair.native.decoder.state, begin_ns + 9 * S
+        send(begin_ns + 8 * S + 100 * MS, 1100)  # it goes again
+        send(late_ns, 1200)
         assert late_ns - state.patch_time_ns[1] > 500 * MS
         pair.do(lambda way: way.decoder.forget(1))
-        send(late_ns + MS, 201)
+        send(late_ns + MS, 1201)
         assert state.patch_time_ns[1] == late_ns + MS
     warnings = [record.message for record in caplog.records if "stands still" in record.message]
     assert [warning.split(" stands still")[0] for warning in warnings] == ["b1: the clock of tip"] * 2

@@ -42,12 +42,13 @@ class SpecifiedClock:
         self._stamp, self._last_ns = -1, -(1 << 63)
         self._drift = self._offset_ns = 0.0
         self.restarts = self.stops = 0
+        self._is_still = False
 
     def known(self) -> dict[str, float]:
         """Return what is known of the clock, by the names in C."""
         found = {name: getattr(self, f"_{name}") for name in ("drift", "offset_ns", "origin_ns", "ticks", "stamp")}
         found |= {"received_ns": self._received_ns, "last_ns": self._last_ns, "n_points": len(self._points)}
-        return found | {"restarts": self.restarts, "stops": self.stops}
+        return found | {"restarts": self.restarts, "stops": self.stops, "is_still": self._is_still}
 
     def convert(self, stamps: npt.ArrayLike, received_ns: npt.ArrayLike) -> Times:
         """Return (n,) int64, CLOCK_MONOTONIC ns: when frames were stamped that were received then."""
@@ -55,12 +56,17 @@ class SpecifiedClock:
         return np.array([self.convert_one(*pair) for pair in pairs], np.int64)
 
     def convert_one(self, stamp: int, received_ns: int) -> int:
+        if self._is_still:
+            passed_ns = received_ns - self._received_ns
+            if passed_ns >= self._part_ns:  # goes it again?
+                self._is_still = 2 * self._step(stamp, received_ns) * self._unit_ns < passed_ns
+                self._received_ns, self._stamp = received_ns, stamp if self._is_still else -1
+            if self._is_still:
+                self._last_ns = received_ns
+                return received_ns
         if self._stamp < 0:
             self._begin(stamp, received_ns)
-        # counts since the stamp before, with as many turns as fit the time that has passed
-        difference = stamp - self._stamp
-        passed = (received_ns - self._received_ns) / self._unit_ns
-        step = difference + round((passed - difference) / self._modulo) * self._modulo
+        step = self._step(stamp, received_ns)
         device_ns = (self._ticks + step) * self._unit_ns
         delay_ns = (received_ns - self._origin_ns) - device_ns
         if step < 0 or delay_ns - self._line_ns(device_ns) < -self._jump_ns:
@@ -75,10 +81,16 @@ class SpecifiedClock:
         # the newest whole part shows that the clock stands still
         if len(self._points) > 1 and self._above_ns(self._points[-2]) - self._offset_ns > _FAR_BEHIND_NS:
             self.stops += 1
-            self._stamp = -1
+            self._is_still = True
             time_ns = received_ns
         self._last_ns = time_ns
         return time_ns
+
+    def _step(self, stamp: int, received_ns: int) -> int:
+        """Return counts since the stamp before, with as many turns as fit the time that has passed."""
+        difference = stamp - self._stamp
+        passed = (received_ns - self._received_ns) / self._unit_ns
+        return difference + round((passed - difference) / self._modulo) * self._modulo
 
     def _begin(self, stamp: int, received_ns: int) -> None:
         self._points.clear()

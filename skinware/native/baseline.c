@@ -206,6 +206,7 @@ void skinware_baseline_update(struct baseline *b, int64_t time_ns, const float *
     compare(b);
     smoothing = b->smooth_s > 0 ? passed_share(passed_s, b->smooth_s) : 1;
     rustle_share = (float)fmax(0.5, sqrt(smoothing / (2 - smoothing)));
+    follow_jumps(b, passed_s);
     follow_common(b, passed_s);
     follow_touches(b, passed_s);
     hold_near(b, passed_s);

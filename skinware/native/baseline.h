@@ -43,6 +43,9 @@
 #define LEAST_GAIN 0.1f       /* with less, something else moves the taxel */
 #define MOST_GAIN 3.0f        /* with more, too */
 #define FEW_TAXELS 3.0        /* free taxels of a patch of which nothing is common */
+#define MANY_TAXELS 20.0      /* free taxels of a patch that no touch covers evenly but for a hand that slams on all of it */
+#define NEARLY_ALL 0.85       /* share of them that has to move alike where the mode jumps */
+#define GAP_S 2.0             /* seconds without data in which a device may have restarted: a jump after them may be a rise */
 #define MATCH_S 2.0           /* seconds in which the agility of the common mode changes e-fold until it explains moves */
 #define RATE_S 30.0           /* seconds over which the speed of the common drift is averaged */
 #define SLOW_S 5.0            /* seconds: deviations that last longer are drift of the taxel, quicker ones are noise */
@@ -89,6 +92,8 @@ struct patch {
     double share;     /* of a load that its cover keeps */
     double moves2;    /* by how much the mode moves from frame to frame, squared, as measured at rest */
     double common;    /* the mode while the rest is measured */
+    double fall, fell_s; /* by how much the mode jumped down of late, and how long ago */
+    double jump, before; /* of a patch that may jump: medians of its free taxels, deviation and smoothed deviation */
     double move, sure; /* by how much the mode moves with this frame, and how much of that is sure */
     double sums[4];   /* of this frame */
 };
@@ -171,6 +176,7 @@ float least_noise2(const struct baseline *b, float level);
 void put(struct baseline *b, int64_t taxel, float by);
 
 /* offsets.c */
+void follow_jumps(struct baseline *b, double passed_s);
 void follow_common(struct baseline *b, double passed_s);
 void learn(struct baseline *b, float rustle_share, double passed_s);
 

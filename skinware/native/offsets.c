@@ -78,6 +78,89 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
     p->sums[WEIGHT] = weights, p->sums[REACH] = reach, p->sums[FOUND] = found, p->sums[FREE] = number;
 }
 
+/* Whether a taxel moved as far as the typical free one of its patch. */
+static int moved_along(const struct baseline *b, int64_t i) {
+    const float jump = (float)b->patches[b->patch[i]].jump;
+    return b->flag[i] && fabsf(b->deviation[i] - jump) < highest(ALIKE * fabsf(jump), b->off[i]);
+}
+
+enum { NUMBER, DOWN, UP, ALONG };
+
+/* Finds patches that may jump; b->flag says which taxels are free: a touch that has just begun may be the jump itself. */
+static int64_t find_jumps(struct baseline *b, double passed_s) {
+    const struct baseline a = *b; /* no store can change it */
+    int64_t i, k, found = 0;
+    for (k = 0; k < b->n_patches; k++)
+        for (i = 0; i < 4; i++)
+            b->patches[k].sums[i] = 0;
+    INDEPENDENT
+    for (i = 0; i < b->n; i++)
+        a.flag[i] = a.live[i] & (a.at_end[i] ^ 1) & ((a.touched[i] ^ 1) | (a.contact_s[i] < 2 * LOOK_AT_S));
+    for (k = 0; k < b->n_runs; k++) {
+        double *sums = b->patches[b->runs[k].patch].sums;
+        int64_t number = 0, down = 0, up = 0;
+        for (i = b->runs[k].first; i < b->runs[k].last; i++) {
+            number += a.flag[i];
+            down += a.flag[i] & (a.deviation[i] < -a.off[i]);
+            up += a.flag[i] & (a.deviation[i] > a.off[i]);
+        }
+        sums[NUMBER] += (double)number, sums[DOWN] += (double)down, sums[UP] += (double)up;
+    }
+    for (k = 0; k < b->n_patches; k++) {
+        struct patch *p = &b->patches[k];
+        const int may_rise = p->fall > 0 || passed_s > GAP_S;
+        const double most = NEARLY_ALL * p->sums[NUMBER];
+        p->fell_s += passed_s;
+        p->fall = p->fell_s > DIP_S ? 0 : p->fall;
+        p->jump = p->sums[NUMBER] > MANY_TAXELS && (p->sums[DOWN] >= most || (may_rise && p->sums[UP] >= most));
+        found += p->jump != 0;
+    }
+    return found;
+}
+
+/*
+ * Moves all offsets of a patch at once where nearly all of its free taxels moved alike and at once, as where its supply
+ * sags: down, as no load does; up, back to where it fell from, or while no data came. A hand that slams shut moves them
+ * alike, too, but from the rest.
+ */
+void follow_jumps(struct baseline *b, double passed_s) {
+    const int64_t stride = sizeof(struct patch) / sizeof(double);
+    int64_t i, k;
+    if (b->is_signed || b->has_no_common || !find_jumps(b, passed_s))
+        return;
+    for (i = 0; i < b->n; i++)
+        b->flag[i] &= b->patches[b->patch[i]].jump != 0;
+    medians(b, b->patch, b->n_patches, b->deviation, b->flag, &b->patches->jump, stride);
+    medians(b, b->patch, b->n_patches, b->smooth, b->flag, &b->patches->before, stride);
+    for (i = 0; i < b->n; i++)
+        b->patches[b->patch[i]].sums[ALONG] += moved_along(b, i);
+    for (k = 0; k < b->n_patches; k++) {
+        struct patch *p = &b->patches[k];
+        const int returns = fabs(p->jump - p->fall) < (double)ALIKE * p->fall;
+        const double hum2 = b->on_sigma * b->on_sigma * (p->variance + p->agility * passed_s); /* is followed as it comes */
+        const int is_alike = p->sums[ALONG] >= NEARLY_ALL * p->sums[NUMBER] && p->jump * p->jump > hum2;
+        const int is_sudden = p->jump < 0 ? fabs(p->before) < -0.3 * p->jump : returns || passed_s > GAP_S;
+        p->jump = is_alike && is_sudden ? p->jump : 0;
+        p->fall = p->jump != 0 ? fmax(-p->jump, 0) : p->fall;
+        p->fell_s = p->jump < 0 ? 0 : p->fell_s;
+    }
+    for (i = 0; i < b->n; i++) {
+        const float jump = (float)b->patches[b->patch[i]].jump;
+        if (jump == 0 || !b->live[i])
+            continue;
+        if (moved_along(b, i)) {
+            put(b, i, b->deviation[i]);
+            b->smooth[i] = 0;
+            if (b->touched[i])
+                end_touch(b, i);
+        } else {
+            b->level[i] += jump;
+            b->deviation[i] -= jump;
+            b->variance[i] += (ALIKE / 3) * (ALIKE / 3) * jump * jump;
+        }
+    }
+}
+
 /* Moves the offsets by the common mode, and takes that off the deviations. */
 void follow_common(struct baseline *b, double passed_s) {
     const struct baseline a = *b; /* no store can change it */
@@ -105,7 +188,7 @@ void follow_common(struct baseline *b, double passed_s) {
     }
 }
 
-enum { NUMBER, BEYOND, TYPICAL };
+enum { BEYOND = 1, TYPICAL }; /* beside NUMBER */
 
 /* Adjusts what changes slowly: the drift of taxels by themselves, and the typical gain of a patch, which is 1. */
 static void tick(struct baseline *b, double passed_s) {

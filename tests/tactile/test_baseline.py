@@ -647,3 +647,32 @@ def test_a_bottle_that_is_emptied_slowly_is_held_to_the_end_and_then_let_go(per_
             seen.append(float(calm.touched[held].mean()))
     assert np.mean(seen) > 0.97
     assert not calm.touched.any()
+
+
+@pytest.mark.parametrize(("counts", "gap_s"), [(-12, 0), (-40, 0), (-12, 10), (12, 10), (40, 10)])
+def test_a_supply_that_sags_is_no_touch_and_changes_none(counts: float, gap_s: float) -> None:
+    """All offsets step and return while fingers hold something: down, or while no samples come."""
+    random, held = np.random.default_rng(5), (np.arange(N) % 12 < 3) & (MODULE < 2)
+    baseline, gain = Baseline(MODULE, np.zeros(N, int)), 1 + 0.1 * random.standard_normal(N)
+    for number in range(1000):
+        time_s = number / 20
+        values = (
+            60 + 25 * held * (10 < time_s < 40) + counts * gain * (20 <= time_s < 30) + 30 * gain * (6 < time_s < 7.5)
+        )
+        time_ns = round((time_s + gap_s * (time_s >= 20) + gap_s * (time_s >= 30)) * 1e9)
+        calm = baseline.update(time_ns, np.round(values + 0.8 * random.standard_normal(N)))
+        if time_s > 8:
+            assert not calm.touched[~held].any(), f"{time_s} s"
+        if 10.2 < time_s < 39.9:
+            assert calm.touched[held].all(), f"{time_s} s"
+            assert np.abs(calm.value[held] - 25).max() < 4 + 0.3 * abs(counts), f"{time_s} s"
+
+
+def test_a_hand_that_slams_shut_after_a_sag_of_the_supply_is_a_touch() -> None:
+    bench = Bench()
+    bench.run(10)
+    bench.run(3, load=-40.0)
+    bench.run(5)
+    shares = list[float]()
+    bench.run(5, load=40.0, each=lambda calm: shares.append(float(calm.touched.mean())))
+    assert min(shares[4:]) == 1

@@ -140,6 +140,20 @@ def test_what_is_left_of_a_load_is_forgotten_when_it_rises_again() -> None:
     assert np.all(touched[20 * 12 :])
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_patches_that_step_as_a_whole_and_gaps(seed: int) -> None:
+    both, random = Both(np.arange(N) // 12, np.arange(N) // 48), np.random.default_rng(seed)
+    gain, held = 1 + 0.1 * random.standard_normal(N), np.arange(N) % 48 < 8
+    time_ns, step = 0, 0
+    for number in range(800):
+        time_ns += 20_000_000 if number % 150 else 5 * _STEP_NS
+        step = int(random.choice([-12, -6, 0, 0, 6, 12])) if number % 60 == 0 else step
+        usable = random.random(N) > 0.02 * (number % 100 > 50)
+        values = 40 + number / 100 * gain + (25 * held + step * gain * (np.arange(N) >= 48)) * (number > 280)
+        both.update(time_ns, np.round(values + 0.6 * random.standard_normal(N)), usable)
+    both.compare_states()
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_taxels_of_few_levels(levels: int) -> None:
     both, random = Both(np.arange(N) // 12, np.arange(N) // 48), np.random.default_rng(levels)

@@ -29,9 +29,14 @@ from skinware.status import Why
 from skinware.tactile.baseline import BaselineSettings, Calm
 from tests.specification.baseline.numbers import (
     ALIKE,
+    DIP_S,
     EPSILON,
     FEW_LEVELS,
     FORGET_AFTER_S,
+    GAP_S,
+    LOOK_AT_S,
+    MANY_TAXELS,
+    NEARLY_ALL,
     OFF_TO_ON,
     RESETTLE_S,
     STEPS_OF_A_TOUCH,
@@ -130,6 +135,8 @@ class SpecifiedBaseline:
         self._surroundings = Surroundings(module, patch)
         self._falls = Falls(self._surroundings)
         self._all_held = False
+        self._fall, self._fell_s = np.zeros((2, self._offsets.patches.n))
+        """By how much each patch jumped down of late, and how long ago."""
         self._forced: Flags = np.zeros(n, bool)
         self._suspect: Flags | None = None
 
@@ -225,13 +232,15 @@ class SpecifiedBaseline:
             self._measure(time_ns, usable, passed_s)
         live = usable & self._ready
         deviation = np.where(live, intake.last - offsets.level - touches.remainders.left, np.float32(0))
-        free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end()
         spread = np.sqrt(offsets.noise2)
+        on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
+        off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
+        if not touches.signed:
+            self._jump(deviation, live, off, passed_s)
+        free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end()
         if not touches.signed:
             low = touches.smooth < -settings.off_sigma * spread
             free &= ~self._falls.sagging & ~(self._falls.below & low)
-        on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
-        off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
         offsets.follow_common(deviation, free, np.where(self._surroundings.held, on * on, np.float32(0)), passed_s)
         touches.follow(deviation, live, on, passed_s, settings.smooth_s)
         rustle = np.float32(touches.noise_share) * off
@@ -300,6 +309,41 @@ class SpecifiedBaseline:
             self._offsets.common.agility[:] = np.maximum(self._rest.moves2 - rounding, 0.01 * rounding) / max(
                 passed_s, 1e-3
             )
+
+    def _jump(self, deviation: Floats, live: Flags, off: Floats, passed_s: float) -> None:
+        """Move the offsets of patches whose free taxels fell alike and at once, returned, or moved in a gap."""
+        offsets, touches, patches = self._offsets, self._touches, self._offsets.patches
+        free = live & ~self._at_end() & (~touches.touched | (touches.contact_s < np.float32(2 * LOOK_AT_S)))
+        number = patches.sum(free)
+        most = NEARLY_ALL * number
+        self._fell_s += passed_s
+        self._fall[self._fell_s > DIP_S] = 0
+        may_rise = (self._fall > 0) | (passed_s > GAP_S)
+        may = patches.sum(free & (deviation < -off)) >= most
+        may |= may_rise & (patches.sum(free & (deviation > off)) >= most)
+        may &= number > MANY_TAXELS
+        if not may.any():
+            return
+        free &= may[patches.group]
+        jump = patches.median(deviation, free).astype(np.float64)
+        before = patches.median(touches.smooth, free).astype(np.float64)
+        by = np.broadcast_to(patches.spread(jump), deviation.shape)
+        along = free & (np.abs(deviation - by) < np.maximum(np.float32(ALIKE) * np.abs(by), off))
+        returns = np.abs(jump - self._fall) < np.float32(ALIKE) * self._fall
+        sudden = np.where(jump < 0, np.abs(before) < -0.3 * jump, returns | (passed_s > GAP_S))
+        hum2 = self._settings.on_sigma**2 * (offsets.common.variance + offsets.common.agility * passed_s)
+        jump[~may | (patches.sum(along) < most) | ~sudden | (jump * jump <= hum2)] = 0
+        jumps = jump != 0
+        self._fall[jumps] = np.maximum(-jump[jumps], 0)
+        self._fell_s[jump < 0] = 0
+        moves = live & jumps[patches.group]
+        rows, others = np.flatnonzero(moves & along), np.flatnonzero(moves & ~along)
+        self._put(rows, deviation[rows], deviation)
+        touches.smooth[rows] = 0
+        touches.end(rows[touches.touched[rows]])
+        offsets.level[others] += by[others]
+        deviation[others] -= by[others]
+        offsets.variance[others] += np.float32(ALIKE / 3) ** 2 * by[others] * by[others]
 
     def _let_go(self, over: Rows, live: Flags, on: Floats, off: Floats, deviation: Floats, passed_s: float) -> None:
         """End touches: what is left of them is what the prediction was wrong by."""

@@ -1,4 +1,5 @@
-/* Finds frames in the bytes of a serial line: serial/packets.py, delimited.py, checksums.py, stream.py. */
+/* Finds frames in the bytes of a serial line: serial/packets.py, delimited.py, checksums.py, stream.py;
+ * its specification is tests/specification/framers.py. */
 #include "framing.h"
 
 struct found { /* a frame */
@@ -97,16 +98,23 @@ static int64_t beginning(const struct framing *framing, const struct stream *str
     return stream->size;
 }
 
-/* Bytes of the frame that begins here, 0: it cannot be. */
-static int64_t total_of(const struct framing *framing, const uint8_t *frame, bool *is_bare)
+/* Bytes of the frame that begins here, at least: while its length is not there; 0: it cannot be. */
+static int64_t total_of(const struct framing *framing, const uint8_t *frame, int64_t left, bool *is_bare)
 {
     int64_t says, total;
     *is_bare = false;
     if (!framing->length.size)
         return framing->longest;
     says = read_field(&framing->length, frame);
-    *is_bare = !says && framing->bare;
-    total = framing->totals ? framing->totals[says] : says + framing->more - (*is_bare ? framing->bare : 0);
+    if (framing->totals) {
+        const struct wire_field *length = framing->lengths + says;
+        if (length->size && left < length->offset + length->size)
+            return length->offset + length->size;
+        total = framing->totals[says] + read_field(length, frame);
+    } else {
+        *is_bare = !says && framing->bare;
+        total = says + framing->more - (*is_bare ? framing->bare : 0);
+    }
     return total >= framing->shortest && total <= framing->longest ? total : 0;
 }
 
@@ -144,7 +152,7 @@ static bool find_packet(const struct framing *framing, struct stream *stream, st
         bool is_bare;
         if (left < framing->known_from || !left)
             return false;
-        total = total_of(framing, frame, &is_bare);
+        total = total_of(framing, frame, left, &is_bare);
         if (left < total)
             return false;
         enum verdict form = total ? form_of(framing, stream, total) : BAD;

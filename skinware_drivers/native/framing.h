@@ -32,6 +32,7 @@ struct framing { /* how frames lie in a stream of bytes; patterns: (n, 256) bool
     struct wire_field length;
     int64_t more, bare;
     const int64_t *totals; /* (256,) of each value of the length, 0: it cannot be; NULL: bytes are counted */
+    const struct wire_field *lengths; /* (256,) with `totals`: what more each value says */
     int64_t behind, known_from, look_ahead, confirms_each;
     int64_t checksum_at, covered_from, covered_to; /* from the beginning; negative, and `covered_to`: from the end */
 };

@@ -19,9 +19,8 @@ from skinware_drivers.serial.checksums import (
 )
 from skinware_drivers.serial.delimited import COBS, HDLC, LINES, SLIP, Delimited
 from skinware_drivers.serial.framing import Field, Unframed
-from skinware_drivers.serial.framings import LengthFirst, Recurring, TextMatrix
+from skinware_drivers.serial.framings import LengthFirst, Part, Recurring, Split, TextMatrix, by_length
 from skinware_drivers.serial.packets import Length, LengthTable, Packet
-from skinware_drivers.serial.stream import Part, Split, by_length
 
 __all__ = [
     "COBS",

@@ -9,11 +9,23 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+
+import numpy as np
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.native import structs
 from skinware_drivers.serial.checksums import Checksum
-from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
+from skinware_drivers.serial.framing import Field, check_body
+from skinware_drivers.serial.stream import (
+    BYTE_VALUES,
+    COBS_FORM,
+    ESCAPED_FORM,
+    LINE_FORM,
+    CompiledFraming,
+    check_parts,
+    compile_checksum,
+    compile_field,
+)
 
 
 class Stuffing(ABC):
@@ -28,10 +40,6 @@ class Stuffing(ABC):
     @abstractmethod
     def encode(self, content: bytes) -> bytes:
         """Return content as it is sent, with delimiters."""
-
-    @abstractmethod
-    def decode(self, segment: bytes) -> bytes | None:
-        """Return the content of a segment between delimiters; None if the segment is malformed."""
 
 
 class Lines(Stuffing):
@@ -51,9 +59,6 @@ class Lines(Stuffing):
         if b"\n" in content:
             raise ValueError(f"a line with an end of line in it: {content!r}")
         return content + b"\n"
-
-    def decode(self, segment: bytes) -> bytes:
-        return segment.removesuffix(b"\r")
 
 
 class Cobs(Stuffing):
@@ -75,24 +80,6 @@ class Cobs(Stuffing):
                     return bytes(encoded) + b"\0"
             encoded += bytes([len(part) + 1]) + part
         return bytes(encoded) + b"\0"
-
-    def decode(self, segment: bytes) -> bytes | None:
-        """Return the content; None if a distance leads beyond the end."""
-        size = len(segment)
-        if not size:
-            return b""
-        code = segment[0]
-        if code == size:
-            return segment[1:]
-        parts = []
-        place = 0
-        while place < size:
-            code = segment[place]
-            parts.append(segment[place + 1 : place + code])
-            place += code
-            if code < 0xFF and place < size:
-                parts.append(b"\0")
-        return b"".join(parts) if place == size else None
 
 
 class Escaped(Stuffing):
@@ -130,16 +117,6 @@ class Escaped(Stuffing):
             content = content.replace(bytes([byte]), bytes([self.escape, code]))
         return self._opening + content + bytes([self.delimiter])
 
-    def decode(self, segment: bytes) -> bytes | None:
-        """Return the content; None if the byte behind an escape byte has no meaning."""
-        first, *others = segment.split(bytes([self.escape]))
-        parts = [first]
-        for part in others:
-            if not part or part[0] not in self.meaning:
-                return None
-            parts += (bytes([self.meaning[part[0]]]), part[1:])
-        return b"".join(parts)
-
 
 LINES = Lines()
 """Lines of text."""
@@ -157,7 +134,7 @@ HDLC = Escaped(
 
 
 @dataclass(frozen=True)
-class Delimited(Framing):
+class Delimited(CompiledFraming):
     """Frames that end with a delimiter: header, body and checksum, stuffed.
 
     The rest of a damaged frame ends at the next delimiter, and the frame behind it is found.
@@ -189,6 +166,9 @@ class Delimited(Framing):
             raise ConfigurationError(f"bodies of {self.minimum_body} to {self.maximum_body} bytes cannot be")
         if self.identifier is not None and self.identifier.end > self.body_start:
             raise ConfigurationError(f"the identifier is not within the header of {self.body_start} bytes")
+        check_parts(self.checksum, self.identifier)
+        if type(self.stuffing) not in (Lines, Cobs, Escaped) or self.body_start < 0:
+            raise ConfigurationError("stuffing is LINES, COBS, SLIP, HDLC or an Escaped; a header has 0 bytes or more")
 
     @property
     def body_start(self) -> int:
@@ -207,8 +187,20 @@ class Delimited(Framing):
         """Whether the bytes before the first delimiter may be a frame."""
         return self.checksum is not None if self.trusts_first is None else self.trusts_first
 
-    def framer(self) -> Framer:
-        return DelimitedFramer(self)
+    def compiled(self, arrays: structs.Arrays) -> structs.Framing:
+        compiled, stuffing = structs.Framing(form=LINE_FORM, body_start=self.body_start), self.stuffing
+        if self.identifier is not None:
+            compiled.identifier = compile_field(self.identifier)
+        if self.checksum is not None:
+            compiled.checksum = compile_checksum(self.checksum, arrays)
+        compiled.shortest, compiled.longest = self.minimum_body + self.overhead, self.maximum_body + self.overhead
+        compiled.delimiter, compiled.longest_segment = stuffing.delimiter, stuffing.longest(compiled.longest)
+        if isinstance(stuffing, Cobs):
+            compiled.form = COBS_FORM
+        elif isinstance(stuffing, Escaped):
+            compiled.form, compiled.escape = ESCAPED_FORM, stuffing.escape
+            compiled.meaning = arrays.of([stuffing.meaning.get(byte, -1) for byte in range(BYTE_VALUES)], np.int16)
+        return compiled
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
         """Return a frame as it is sent; the header is zero except for the identifier."""
@@ -220,61 +212,3 @@ class Delimited(Framing):
         if self.checksum is not None:
             content += self.checksum.to_bytes(content)
         return self.stuffing.encode(content)
-
-
-class DelimitedFramer(Framer):
-    """Finds the frames of a stream with delimiters."""
-
-    def __init__(self, framing: Delimited) -> None:
-        super().__init__()
-        self._framing = framing
-        self._shortest = framing.minimum_body + framing.overhead
-        self._longest = framing.maximum_body + framing.overhead
-        self._longest_segment = framing.stuffing.longest(self._longest)
-        self._delimiter = bytes([framing.stuffing.delimiter])
-        self._decode = framing.stuffing.decode
-        self._checksum_size = framing.checksum.size if framing.checksum is not None else 0
-        self._discarding = not framing.is_first_trusted  # everything up to the next delimiter
-
-    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
-        *segments, rest = stream.split(self._delimiter)
-        ends = list(accumulate([len(segment) + 1 for segment in segments], initial=self._before))
-        if self._discarding and segments:
-            self._discarding = False
-            self.counters.skipped_bytes += len(segments[0]) + 1
-            del segments[0], ends[0]
-        first, field = self._framing.body_start, self._framing.identifier
-        found: list[Framed] = []
-        for segment, (begin, end) in zip(segments, pairwise(ends), strict=True):
-            content = self._content(segment)
-            if content is not None:
-                self.counters.frame_bytes += end - begin
-                found.append(Framed(0 if field is None else field.of(content), content[first:], end))
-        kept = len(rest)
-        if not self._discarding and kept > self._longest_segment:
-            self._discarding = True
-            self.counters.refused += 1
-        if self._discarding:
-            self.counters.skipped_bytes += kept
-            kept = 0
-        return found, len(stream) - kept
-
-    def _content(self, segment: bytes) -> bytes | None:
-        """Return header and body of a segment; None, and counted, if it is no frame."""
-        content = self._decode(segment) if len(segment) <= self._longest_segment else None
-        if content is not None and self._shortest <= len(content) <= self._longest:
-            checksum = self._framing.checksum
-            if checksum is None:
-                return content
-            size = self._checksum_size
-            covered = content[:-size]
-            if checksum.of(covered) == int.from_bytes(content[-size:], checksum.order):
-                return covered
-            self.counters.checksum_errors += 1
-        elif content == b"":
-            self.counters.idle_bytes += len(segment) + 1
-            return None
-        else:
-            self.counters.refused += 1
-        self.counters.skipped_bytes += len(segment) + 1
-        return None

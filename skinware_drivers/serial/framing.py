@@ -8,7 +8,7 @@ the bytes that arrive, in pieces of any size, and returns the frames that are co
   ``bytes_in == frame_bytes + idle_bytes + skipped_bytes + framer.pending``.
 * The bytes held back are bounded by the longest frame of the declaration.
 
-Frames are found one by one, in plain Python over ``bytes`` methods: docs/decisions/0009 says why.
+Frames are found one by one: docs/decisions/0009 says why.
 """
 
 from __future__ import annotations
@@ -181,6 +181,9 @@ class Framer(ABC):
         self._rest = stream[done:]
         self._before += done
         self.counters.frames += len(found)
+        return self._split(found)
+
+    def _split(self, found: list[Framed]) -> list[Framed]:
         if self.splitting is None:
             return found
         split = self.splitting

@@ -1,13 +1,14 @@
-"""Find frames that begin with their length, that recur after a marker, or that are matrices of text."""
+"""Find frames that begin with their length, recur after a marker, or are matrices of text; and split frames."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
+from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, Splitting, check_body
 
 _MOST_IN_VAIN = 3
 
@@ -270,3 +271,54 @@ class _TextMatrixFramer(Framer):
         if max(map(max, numbers)) > 0xFF:
             return None
         return bytes((len(numbers), *columns, *(number for row in numbers for number in row)))
+
+
+class Part(NamedTuple):
+    """A part of a body that becomes a frame.
+
+    Attributes:
+        identifier: of that frame.
+        start: first byte in the body.
+        stop: one past the last.
+    """
+
+    identifier: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Split(Framing):
+    """Frames of another framing that is not split, each split into several with the time and the end of the whole.
+
+    Attributes:
+        whole: how frames lie in the stream, and how commands are sent.
+        splitting: returns the parts of a frame; must not raise, whatever it is given.
+    """
+
+    whole: Framing
+    splitting: Splitting
+    maximum_body: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "maximum_body", self.whole.maximum_body)
+
+    def framer(self) -> Framer:
+        framer = self.whole.framer()
+        framer.splitting = self.splitting
+        return framer
+
+    def encode(self, identifier: int, payload: bytes) -> bytes:
+        return self.whole.encode(identifier, payload)
+
+
+def by_length(known: Mapping[tuple[int, int], Sequence[Part]]) -> Splitting:
+    """Return a splitting of frames of known identifiers and lengths of body; others stay whole."""
+
+    def split(identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
+        parts = known.get((identifier, len(body)))
+        if parts is None:
+            return [(identifier, body)]
+        return [(part.identifier, body[part.start : part.stop]) for part in parts]
+
+    return split

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 from skinware.errors import ConfigurationError
+from skinware_drivers.native import structs
 from skinware_drivers.serial.checksums import Checksum
-from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, check_body
-
-_GOOD, _REFUSED, _INCOMPLETE = range(3)
-
-Pattern = Sequence[int | Collection[int]]
-"""The value of each byte, or the values that it can have."""
+from skinware_drivers.serial.framing import Field, check_body
+from skinware_drivers.serial.stream import (
+    BYTE_VALUES,
+    PACKET_FORM,
+    CompiledFraming,
+    Pattern,
+    check_parts,
+    compile_checksum,
+    compile_field,
+    compile_pattern,
+    values_of,
+)
 
 
 @dataclass(frozen=True)
@@ -49,7 +57,7 @@ class LengthTable:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Packet(Framing):
+class Packet(CompiledFraming):
     """Frames with a known beginning and length: header, body, checksum and trailer.
 
     The bytes of a beginning can also occur in a body, or in the rest of a damaged frame. If the checksum, the trailer
@@ -109,6 +117,8 @@ class Packet(Framing):
             raise ConfigurationError(f"the checksum covers bytes {self.covered(most)} of a frame of {most}")
         if self.bare_when_empty and (not isinstance(self.length, Length) or self.checksum_at is not None):
             raise ConfigurationError("bare_when_empty needs a length field, and a checksum at the end")
+        check_parts(self.checksum, self.identifier)
+        self._check_places()
 
     @property
     def body_start(self) -> int:
@@ -167,8 +177,51 @@ class Packet(Framing):
             return 0
         return self.longest if self.trailer else len(self.sync)
 
-    def framer(self) -> Framer:
-        return PacketFramer(self)
+    def compiled(self, arrays: structs.Arrays) -> structs.Framing:
+        compiled = structs.Framing(form=PACKET_FORM, body_start=self.body_start)
+        if self.identifier is not None:
+            compiled.identifier = compile_field(self.identifier)
+        if self.checksum is not None:
+            compiled.checksum = compile_checksum(self.checksum, arrays)
+        compiled.shortest, compiled.longest, compiled.behind = self.shortest, self.longest, self.behind
+        compiled.n_sync, compiled.sync = compile_pattern(self.sync, arrays)
+        compiled.n_trailer, compiled.trailer = compile_pattern(self.trailer, arrays)
+        if isinstance(self.length, Length):
+            compiled.length, compiled.more = compile_field(self.length.field), self.length.more
+            if self.bare_when_empty and self.checksum is not None:
+                compiled.bare = self.checksum.size
+        elif isinstance(self.length, LengthTable):
+            compiled.length = compile_field(Field(self.length.offset))
+            known = [self.length.total.get(value, 0) for value in range(BYTE_VALUES)]
+            compiled.totals = arrays.of([one.more if isinstance(one, Length) else one for one in known], np.int64)
+            of_each = [compile_field(one.field) if isinstance(one, Length) else structs.WireField() for one in known]
+            compiled.lengths = arrays.structs(structs.WireField, of_each)[1]
+        compiled.known_from, compiled.look_ahead = self.known_from, self.look_ahead
+        compiled.confirms_each = self.confirmed == "each"
+        compiled.checksum_at = self.checksum_place(0)
+        compiled.covered_from, compiled.covered_to = self.covered(0)
+        return compiled
+
+    def _check_places(self) -> None:
+        """Refuse a frame of which a byte that is looked at may lie outside."""
+        least = least_checked = self.shortest
+        ends = [self.body_start, len(self.sync), len(self.trailer)]
+        if isinstance(self.length, Length):
+            ends.append(self.length.field.offset)
+            if self.bare_when_empty:
+                least_checked = max(least, 1 + self.length.more)
+        elif isinstance(self.length, LengthTable):
+            ends.append(self.length.offset)
+            if any(isinstance(one, Length) and one.field.end > self.longest for one in self.length.total.values()):
+                raise ConfigurationError("a length lies beyond the longest frame")
+        if self.identifier is not None:
+            ends.append(self.identifier.end)
+        if self.checksum is not None:
+            ends += [self.checksum_at or 0, (self.checksum_at or 0) + self.checksum.size]
+            begin, end = self.covered(least_checked)
+            ends.append(0 if 0 <= begin <= end <= least_checked else -1)
+        if min(ends) < 0 or max(ends) > least or self.behind > least_checked:
+            raise ConfigurationError(f"a part of the frame lies outside its shortest form of {least} bytes")
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
         """Return a frame as it is sent; bytes of the header that the declaration leaves open are zero.
@@ -231,126 +284,5 @@ class Packet(Framing):
         return self.checksum_at + self.checksum.size, total - len(self.trailer)
 
 
-def values_of(what: int | Collection[int]) -> list[int]:
-    """Return the values that a byte of a pattern can have, ascending."""
-    return [what] if isinstance(what, int) else sorted(what)
-
-
 def _first(pattern: Pattern) -> bytes:
     return bytes(values_of(what)[0] for what in pattern)
-
-
-class PacketFramer(Framer):
-    """Finds the frames of a stream by their beginnings."""
-
-    def __init__(self, framing: Packet) -> None:
-        super().__init__()
-        self._framing = framing
-        self._begin = re.compile(_prefixes([values_of(what) for what in framing.sync]), re.DOTALL)
-        self._whole_sync = re.compile(b"".join(_one_of(values_of(what)) for what in framing.sync), re.DOTALL)
-        self._whole_trailer = re.compile(b"".join(_one_of(values_of(what)) for what in framing.trailer), re.DOTALL)
-        self._known_from, self._look_ahead = framing.known_from, framing.look_ahead
-        self._bare = framing.checksum.size if framing.bare_when_empty and framing.checksum else 0
-        self._checksum_at = framing.checksum_place(0)  # from the end, if negative
-        self._covered_from, self._covered_to = framing.covered(0)  # from the beginning, and from the end
-        self._confirms_each = framing.confirmed == "each"
-        self._follows_at = -1  # place in the stream at which a frame would follow the last one at once
-
-    def _find(self, stream: bytes) -> tuple[list[Framed], int]:
-        found: list[tuple[int, int, bool]] = []
-        done = self._search(stream, 0, found)
-        framing, field = self._framing, self._framing.identifier
-        first, behind, bare = framing.body_start, framing.behind, self._bare
-        return [
-            Framed(
-                0 if field is None else field.of(stream, place),
-                stream[place + first : place + total - behind + (bare if is_bare else 0)],
-                self._before + place + total,
-            )
-            for place, total, is_bare in found
-        ], done
-
-    def _search(self, stream: bytes, place: int, found: list[tuple[int, int, bool]]) -> int:
-        """Judge possible beginnings from ``place`` on; return the place of the first that needs more bytes."""
-        counters, size = self.counters, len(stream)
-        while True:
-            match = self._begin.search(stream, place)
-            begin = size if match is None else match.start()
-            counters.skipped_bytes += begin - place
-            place = begin
-            if size - place < self._known_from or place == size:
-                return place
-            total, is_bare = self._total(stream, place)
-            follows = not self._look_ahead or (not self._confirms_each and self._before + place == self._follows_at)
-            if total:
-                if size - place < total:
-                    self._wanted = total
-                    return place
-                form = self._form(stream, place, total, follows)
-                if form == _INCOMPLETE:
-                    self._wanted = total + self._look_ahead
-                    return place
-                if form == _GOOD:
-                    if is_bare or self._has_checksum(stream, place, total):
-                        counters.frame_bytes += total
-                        found.append((place, total, is_bare))
-                        place += total
-                        self._follows_at = self._before + place
-                        continue
-                    counters.checksum_errors += 1
-                else:
-                    counters.refused += 1
-            else:
-                counters.refused += 1
-            counters.skipped_bytes += 1
-            place += 1
-
-    def _total(self, stream: bytes, place: int) -> tuple[int, bool]:
-        """Return the bytes of the frame that begins here, 0 if impossible; and whether it has no checksum."""
-        framing = self._framing
-        length: int | Length | LengthTable = framing.length
-        if isinstance(length, LengthTable):
-            length = length.total.get(stream[place + length.offset], 0)
-        if isinstance(length, int):
-            total, is_bare = length, False
-        elif len(stream) - place < length.field.end:  # at least
-            return length.field.end, False
-        else:
-            says = length.field.of(stream, place)
-            is_bare = says == 0 and self._bare > 0
-            total = says + length.more - (self._bare if is_bare else 0)
-        return (total if framing.shortest <= total <= framing.longest else 0), is_bare
-
-    def _form(self, stream: bytes, place: int, total: int, follows: bool) -> int:
-        """Judge the trailer of the frame and, unless it follows another one, the beginning of the next."""
-        n = len(self._framing.trailer)
-        if n and not self._whole_trailer.match(stream, place + total - n):
-            return _REFUSED
-        if follows:
-            return _GOOD
-        if len(stream) - place < total + self._look_ahead:
-            return _INCOMPLETE
-        if not self._whole_sync.match(stream, place + total):
-            return _REFUSED
-        return _GOOD if not n or self._whole_trailer.match(stream, place + 2 * total - n) else _REFUSED
-
-    def _has_checksum(self, stream: bytes, place: int, total: int) -> bool:
-        checksum = self._framing.checksum
-        if checksum is None:
-            return True
-        end = place + total
-        at = (end if self._checksum_at < 0 else place) + self._checksum_at
-        covered = stream[place + self._covered_from : end + self._covered_to]
-        return checksum.of(covered) == int.from_bytes(stream[at : at + checksum.size], checksum.order)
-
-
-def _one_of(values: Sequence[int]) -> bytes:
-    return b"[" + b"".join(re.escape(bytes([value])) for value in values) + b"]"
-
-
-def _prefixes(pattern: Sequence[Sequence[int]]) -> bytes:
-    """Return a regular expression of the pattern, or of its beginning at the end of the stream."""
-    if not pattern:
-        return b""
-    rest = _prefixes(pattern[1:])
-    return _one_of(pattern[0]) + (b"(?:\\Z|" + rest + b")" if rest else b"")

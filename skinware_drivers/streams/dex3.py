@@ -33,7 +33,7 @@ from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.stream import Split
+from skinware_drivers.serial.framings import Split
 from skinware_drivers.streams.dds import ENCAPSULATION, SOURCE_TIME, DdsAdapter, DdsTopic, samples
 
 _SIDES = ("left", "right")

@@ -21,8 +21,8 @@ from skinware_drivers.link import Link
 from skinware_drivers.options import Options
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.framings import Split
 from skinware_drivers.serial.packets import Length, Packet
-from skinware_drivers.serial.stream import Split
 
 _HEADER, _OVERHEAD, _LONGEST_DATAGRAM = 24, 28, 1500
 _HEAD = struct.Struct("<BBHI")

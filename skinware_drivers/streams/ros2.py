@@ -32,7 +32,7 @@ from skinware_drivers.operations import operation
 from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.stream import Split
+from skinware_drivers.serial.framings import Split
 from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.dds import LONGEST, SOURCE_TIME, DdsAdapter, DdsTopic, TopicBus, samples
 from skinware_drivers.streams.ros2_map import guessed, preset, read_map, texts_of

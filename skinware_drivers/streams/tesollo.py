@@ -40,8 +40,7 @@ from skinware_drivers.options import Options
 from skinware_drivers.polling import Notice, Poll, ZeroWatch
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.framing import Encoding, Field, Framing
-from skinware_drivers.serial.framings import LengthFirst
-from skinware_drivers.serial.stream import Part, Split, by_length
+from skinware_drivers.serial.framings import LengthFirst, Part, Split, by_length
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 

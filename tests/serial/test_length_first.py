@@ -11,8 +11,7 @@ from skinware.errors import BusNotAvailable, ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Field, Framed
-from skinware_drivers.serial.framings import LengthFirst
-from skinware_drivers.serial.stream import Part, Split, by_length
+from skinware_drivers.serial.framings import LengthFirst, Part, Split, by_length
 from skinware_drivers.testing.waiting import wait_until
 from tests.streams.peers import LOCAL, opened, server
 

@@ -20,8 +20,9 @@ from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.options import NoOptions
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.serial.framing import Framed, Framer, Framing
-from skinware_drivers.serial.packets import Packet, PacketFramer
+from skinware_drivers.serial.framing import Framed, Framer, Framing, ReceivedFraming
+from skinware_drivers.serial.packets import Packet
+from skinware_drivers.serial.stream import NativeFramer
 from skinware_drivers.testing.driving import Driving, driving_lines
 from skinware_drivers.testing.waiting import wait_until
 from tests.serial.lines import DATA, FRAMING, N_TAXELS, Line, data_frame, line
@@ -184,14 +185,16 @@ def test_it_is_unplugged_while_frames_flow() -> None:
         wait_until(lambda: running.status()["buses"][0]["state"] == "gone")
 
 
-class OfItsOwn(Packet):
+class OfItsOwn(ReceivedFraming):
     """What a package outside may write."""
 
+    maximum_body = 2 * N_TAXELS
+
     def framer(self) -> Framer:
-        return Shouting(self)
+        return Shouting(Packet(sync=b"\xa5", length=1 + 2 * N_TAXELS, confirmed="each"))
 
 
-class Shouting(PacketFramer):
+class Shouting(NativeFramer):
     """Whose values are ten more than were sent."""
 
     def feed(self, chunk: bytes) -> list[Framed]:
@@ -199,7 +202,7 @@ class Shouting(PacketFramer):
 
 
 class Loud(Fingertip):
-    framing = OfItsOwn(sync=b"\xa5", length=1 + 2 * N_TAXELS, confirmed="each")
+    framing = OfItsOwn()
     layout = Layout([Frame("taxels", [], [2 * N_TAXELS], Values(0, "u1", N_TAXELS))])
 
 

@@ -17,11 +17,12 @@ from skinware.realtime import now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import parse_bus_name
 from skinware_drivers.registry import make_bus
-from skinware_drivers.serial import stream
+from skinware_drivers.serial import bus as serial_bus
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Unframed
 from skinware_drivers.serial.packets import Length, Packet
+from skinware_drivers.serial.stream import PythonStream
 from skinware_drivers.testing.waiting import wait_until
 from tests.serial.lines import ASK, DATA, FRAMING, data_frame, is_readable, line, opened, receive
 
@@ -30,7 +31,7 @@ from tests.serial.lines import ASK, DATA, FRAMING, data_frame, is_readable, line
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which kind of stream finds frames."""
     if request.param == "python":
-        monkeypatch.setattr(stream, "can_compile", lambda _: False)
+        monkeypatch.setattr(serial_bus, "stream_of", PythonStream)
 
 
 PACKETS = Packet(

@@ -13,8 +13,10 @@ import pytest
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters, FramerCounters
 from skinware_drivers.serial import bus
+from skinware_drivers.serial.delimited import Delimited
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.stream import NativeStream, PythonStream, Stream, can_compile
+from skinware_drivers.serial.packets import Packet
+from skinware_drivers.serial.stream import NativeStream, PythonStream, Stream
 from skinware_drivers.testing import conformance
 from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.rig import Running, Suite, play
@@ -23,6 +25,7 @@ from skinware_drivers.testing.waiting import defect, require
 from skinware_drivers.testing.wire import Stumbling
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.specification.both_paths import Pair, hand_clock
+from tests.specification.framers import InPython
 from tests.specification.one_path import Publishing
 
 
@@ -124,10 +127,10 @@ def made(
         counters: of the bus.
         kind: of the stream in C.
     """
-    if not can_compile(framing):
+    if not isinstance(framing, Packet | Delimited):
         return PythonStream(framing, payload_size, counters)
     in_c = kind(framing, payload_size, deepcopy(counters))
-    return BothStreams(in_c, framing, payload_size, counters)
+    return BothStreams(in_c, InPython(framing), payload_size, counters)
 
 
 Trouble = Literal["nothing", "lost", "truncated", "repeated", "garbage", "stumbling", "restart"]

@@ -13,10 +13,10 @@ from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import BusName, parse_bus_name
 from skinware_drivers.registry import make_bus
-from skinware_drivers.serial import stream
+from skinware_drivers.serial import bus as serial_bus
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.framing import Unframed
-from skinware_drivers.serial.stream import CHUNK
+from skinware_drivers.serial.stream import CHUNK, PythonStream
 from skinware_drivers.streams.tcp import TcpBus, TcpServerBus
 from skinware_drivers.testing.waiting import wait_until
 from tests.serial.lines import data_frame, is_readable, receive
@@ -27,7 +27,7 @@ from tests.streams.peers import LOCAL, free_port, opened, server
 def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which kind of stream finds frames."""
     if request.param == "python":
-        monkeypatch.setattr(stream, "can_compile", lambda _: False)
+        monkeypatch.setattr(serial_bus, "stream_of", PythonStream)
 
 
 def send_until_refused(bus: SerialBus) -> int:

@@ -33,7 +33,7 @@ def instrumented() -> dict[str, Callable[[bytes], None]]:
     import atheris
 
     with contextlib.redirect_stderr(io.StringIO()):  # a line for every module
-        with atheris.instrument_imports(include=["skinware_drivers.serial"]):
+        with atheris.instrument_imports(include=["skinware_drivers.serial", "tests.specification.framers"]):
             from tests.serial.fuzzing import known_examples, run
     return {name: partial(run, example) for name, example in known_examples().items()}
 

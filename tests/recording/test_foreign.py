@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
@@ -26,9 +26,10 @@ import skinware.recording
 from skinware.cli._command import exit_status
 from skinware.cli.convert import command as skin_convert
 from skinware.conversion import convert_foreign
-from skinware.conversion.foreign import guess, open_source
+from skinware.conversion.foreign import bags, guess, open_source
 from skinware.conversion.foreign.source import BLOCK_BYTES, whole
 from skinware.errors import ConfigurationError
+from skinware.limits import Limits
 from skinware.recording import Series
 from skinware.status import Status
 
@@ -273,7 +274,7 @@ def messages(points: npt.NDArray[np.float32], image: npt.NDArray[np.uint16], num
             yield number, "/touch", ros.std_msgs__msg__Float32MultiArray(layout, numbers[number])
 
 
-def write_bag(path: Path, kind: str, made: Any) -> None:
+def write_bag(path: Path, kind: str, made: Any, packing: str = "") -> None:
     store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
     writer: Any
     if kind == "ros1":
@@ -281,6 +282,12 @@ def write_bag(path: Path, kind: str, made: Any) -> None:
     else:
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         writer, serialize = Writer2(path, version=9, storage_plugin=plugin), store.serialize_cdr
+    if packing:
+        writer.set_compression(
+            *[writer.CompressionFormat[packing]]
+            if kind == "ros1"
+            else [CompressionMode[packing], CompressionFormat.ZSTD]
+        )
     with writer:
         connections: dict[str, Any] = {}
         for number, topic, message in made:
@@ -319,6 +326,23 @@ def test_bags(tmp_path: Path, kind: str) -> None:
     if kind == "mcap":  # the file in the folder alone
         (inner,) = path.glob("*.mcap")
         require(imported(inner)["cloud"], points[:, :, 3], TIMES[:40])
+
+
+@pytest.mark.parametrize(
+    ("kind", "packing"),
+    [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite", "FILE"), ("sqlite", "MESSAGE"), ("mcap", "STORAGE")],
+)
+def test_packed_bags_are_read_as_far_as_the_limits_go(
+    tmp_path: Path, kind: str, packing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layout, numbers = ros.std_msgs__msg__MultiArrayLayout([], 0), np.arange(40, dtype=np.float32).reshape(4, 10)
+    made = [(number, "/touch", ros.std_msgs__msg__Float32MultiArray(layout, row)) for number, row in enumerate(numbers)]
+    path = tmp_path / ("walk.bag" if kind == "ros1" else "walk")
+    write_bag(path, kind, made, packing)
+    require(only(path), numbers, TIMES[:4])
+    monkeypatch.setattr(bags, "LIMITS", Limits(chunk_size=40, always_size=40, ratio=0))
+    with pytest.raises(ConfigurationError, match=r"walk.*: no bag of ROS, or damaged.* becomes? more than 40 bytes"):
+        imported(path)
 
 
 def test_a_topic_whose_shape_changes(tmp_path: Path) -> None:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import bz2
 import contextlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import functools
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import fields, is_dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +20,7 @@ import numpy.typing as npt
 from skinware.conversion.foreign.source import BLOCK_BYTES, ColumnSource, Rows, blamed
 from skinware.conversion.tables import package
 from skinware.errors import ConfigurationError
+from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S
 
 LOG_TIME = "log_time"
@@ -23,6 +29,7 @@ _FIELDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8
 """Types of numbers in points."""
 _PIXELS = {"8": "u1", "16": "u2", "32": "f4", "mono8": "u1", "mono16": "u2"}
 _MOST_ROWS = 1000
+_MCAP = "rosbag2.storage_mcap"
 
 
 class BagSource(ColumnSource):
@@ -35,6 +42,7 @@ class BagSource(ColumnSource):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         bags = package("rosbags.highlevel", "bags of ROS")
+        _bound_rosbags()
         stores = package("rosbags.typesys", "bags of ROS")
         self._files, self._miscounts = ExitStack(), dict[str, str]()
         with self._blamed("open it with its own tools, or record it again"):
@@ -98,6 +106,42 @@ class BagSource(ColumnSource):
             return f"{self.path}: no bag of ROS, or damaged{where} ({reason}): {what_to_do}"
 
         return blamed(say)
+
+
+@functools.cache
+def _bound_rosbags() -> None:
+    """Let rosbags decompress no more than the limits allow, in memory and to files: it asks for no limit."""
+    ros1, ros2, mcap = (import_module(f"rosbags.{name}") for name in ("rosbag1.reader", "rosbag2.reader", _MCAP))
+    unbound, lz4 = ros2.zstd, _bounded(import_module("lz4.frame").LZ4FrameDecompressor)
+    zstd = _bounded(unbound.ZstdDecompressor)
+
+    @contextlib.contextmanager
+    def opened(file: IO[bytes], mode: str) -> Iterator[SimpleNamespace]:
+        most = LIMITS.room(os.fstat(file.fileno()).st_size)
+        with unbound.open(file, mode) as stream:
+
+            def read(size: int) -> bytes:
+                if stream.tell() > most:
+                    raise ValueError(f"its file becomes more than {most} bytes")
+                data: bytes = stream.read(size)
+                return data
+
+            yield SimpleNamespace(read=read)
+
+    ros1.decompressors.update(bz2=_bounded(bz2.BZ2Decompressor), lz4=lz4)
+    mcap.DECOMPRESSORS.update(zstd=zstd, lz4=lz4)
+    ros2.zstd = SimpleNamespace(open=opened, decompress=zstd)
+
+
+def _bounded(make: Callable[[], Any]) -> Callable[..., bytes]:
+    def decompress(data: bytes, *_: object) -> bytes:
+        unpacker = make()
+        unpacked: bytes = unpacker.decompress(data, LIMITS.chunk_size)
+        if not unpacker.eof:
+            raise ValueError(f"{len(data)} packed bytes end too early, or become more than {LIMITS.chunk_size} bytes")
+        return unpacked
+
+    return decompress
 
 
 def _columns(message: Any) -> dict[str, Any]:

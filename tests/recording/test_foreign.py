@@ -201,6 +201,20 @@ def test_pictures_in_parquet_are_read_a_few_at_a_time(tmp_path: Path) -> None:
         assert all(rows["picture"].nbytes <= BLOCK_BYTES for rows in source.blocks("", ["picture"]))
 
 
+def test_opening_parquet_reads_its_first_rows_alone(tmp_path: Path) -> None:
+    path = tmp_path / "long.parquet"
+    numbers = np.random.default_rng(1).random((4, 200_000))
+    pa.parquet.write_table(pa.table(list(numbers), names=["time", "a", "b", "c"]), path, use_dictionary=False)
+
+    def read_bytes() -> int:
+        return int(Path("/proc/self/io").read_text().split()[1])
+
+    open_source(path).close()  # which imports pyarrow
+    before = read_bytes()
+    open_source(path).close()
+    assert read_bytes() - before < path.stat().st_size / 2
+
+
 def test_a_parquet_page_that_does_not_fit_its_checksum(tmp_path: Path) -> None:
     path = tmp_path / "flipped.parquet"
     table = pa.table({"time": TIMES, "taxel_0": counts(N)})

@@ -22,6 +22,8 @@ from skinware.errors import ConfigurationError
 
 _BATCH_ROWS = 4096
 _HEADER_BYTES = 1 << 16
+_AS_NEEDED: dict[str, Any] = {"pre_buffer": False, "buffer_size": 1 << 18}
+"""Read Parquet a part of a column at a time, not whole groups of rows."""
 _MOST_NUMBERS = 1 << 20
 """In a row of an array."""
 _TEXTS = ("string", "large_string")
@@ -157,7 +159,7 @@ class ParquetSource(ColumnSource):
 
     def _opened(self, path: Path) -> Any:
         with blamed(lambda reason: f"{path}: not Parquet, or damaged ({reason})"):
-            return self._arrow.parquet.ParquetFile(path, page_checksum_verification=True)
+            return self._arrow.parquet.ParquetFile(path, page_checksum_verification=True, **_AS_NEEDED)
 
     def _array(self, path: Path, name: str, column: Any) -> npt.NDArray[Any]:
         shape = [len(column)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import re
 from collections import Counter
@@ -141,10 +142,10 @@ class TextSource(ColumnSource):
         else:
             is_even = all(line.count(separator) == count - 1 or not line.strip() for line in lines)
         if is_even:
-            try:
-                return np.loadtxt(lines, delimiter=separator, comments=None, quotechar='"', usecols=places, ndmin=2)
-            except ValueError:
-                pass  # an empty cell, or one to complain about
+            with contextlib.suppress(ValueError):  # an empty cell, or one to complain about, as is one out of range
+                found = np.loadtxt(lines, delimiter=separator, comments=None, quotechar='"', usecols=places, ndmin=2)
+                if not np.isinf(found).any():
+                    return found
         rows = [[self._float(cells[place], line) for place in places] for line, cells in self._split(lines, first)]
         return np.array(rows, np.float64).reshape(-1, len(places))
 
@@ -175,8 +176,8 @@ class TextSource(ColumnSource):
 
     def _float(self, cell: str, line: int) -> float:
         number = _number(cell)
-        if number is None:
-            self._damaged(line, f"{cell[:_SHOWN]!r} is no number")
+        if number is None or (np.isinf(number) and "inf" not in cell.lower()):
+            self._damaged(line, f"{cell[:_SHOWN]!r} is {'no number' if number is None else 'out of range'}")
         return number
 
     def _lines_of(self, read: Sequence[bytes], at: int) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
+from skinware.drivers import LOOK_EVERY_NS
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
@@ -26,7 +27,6 @@ from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
 _JUDGE_EVERY_NS = NS_PER_S // 5
-_LOOK_EVERY_NS = NS_PER_S // 10
 _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _EARLY_NS = 5_000_000
@@ -62,6 +62,7 @@ class Origin:
         self._contacts = [LiveSources[ContactsSample](each, ContactsReader) for each in namespaces]
         self._motion = [LiveSources[MotionSample](each, MotionReader) for each in namespaces]
         self._services: list[LiveSources[Any]] = [*self._contacts, *self._motion]
+        self._look_ns = 0
 
     @property
     def title(self) -> str:
@@ -69,12 +70,11 @@ class Origin:
         return self.recording or self.namespace.name
 
     def look(self) -> list[LiveDriver]:
-        drivers = self.live.look()
-        if self._calm is not None:
-            self._calm.look()
-        for services in self._services:
-            services.look()
-        return drivers
+        if now_ns() >= self._look_ns:
+            self._look_ns = now_ns() + LOOK_EVERY_NS // 2
+            for services in [*self._services, *([] if self._calm is None else [self._calm])]:
+                services.look()
+        return self.live.look()
 
     def is_due(self, live: LiveDriver) -> bool:
         """Return whether the newest snapshot of a driver may be shown: its calmed one is here, or will not follow."""
@@ -239,7 +239,7 @@ class Follower:
         self.origins = origins
         self.drivers: list[ShownDriver] = []
         self.problem: str | None = None
-        self.edition = self._look_ns = 0
+        self.edition = 0
         self.functions: dict[str, PlotFunction] = {}
         self.robot = robot or Robot()
         self.scene = Scene({}, self.robot.poses)
@@ -258,14 +258,22 @@ class Follower:
         Returns:
             The drivers with a newer snapshot; their ``changes``, and ``edition``, show what else has changed.
         """
-        if now_ns() >= self._look_ns:
-            self._look_ns, self.problem = now_ns() + _LOOK_EVERY_NS, None
-            try:
-                self._look()
-            except NamespaceError as error:
-                self.problem = str(error)
-        if self.problem is not None:
+        self.problem = None
+        try:
+            found = [(live, origin) for origin in self.origins for live in origin.look()]
+        except NamespaceError as error:
+            self.problem = str(error)
             return []
+        if [driver.live for driver in self.drivers] != [live for live, _ in found]:
+            kept = {id(driver.live): driver for driver in self.drivers}
+            gone, self.drivers = self.drivers, []
+            for live, origin in found:
+                number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
+                self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
+            for driver in gone:
+                if driver not in self.drivers:
+                    driver.close()
+            self._arrange()
         generations = [driver.generation for driver in self.drivers]
         newer = [driver for driver in self.drivers if self._take(driver, period_ns)]
         if generations != [driver.generation for driver in self.drivers]:
@@ -278,20 +286,6 @@ class Follower:
         for origin in self.origins:
             origin.close()
         self.drivers = []
-
-    def _look(self) -> None:
-        """Look for drivers that came or went."""
-        found = [(live, origin) for origin in self.origins for live in origin.look()]
-        if [driver.live for driver in self.drivers] != [live for live, _ in found]:
-            kept = {id(driver.live): driver for driver in self.drivers}
-            gone, self.drivers = self.drivers, []
-            for live, origin in found:
-                number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
-                self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
-            for driver in gone:
-                if driver not in self.drivers:
-                    driver.close()
-            self._arrange()
 
     def _take(self, driver: ShownDriver, period_ns: int) -> bool:
         if now_ns() - driver.taken_ns < period_ns - _EARLY_NS:

@@ -224,10 +224,10 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
         return []
     source = frame.source
     try:
-        sensors = structure.index(source.type_name)
+        sensors, together = structure.index(source.type_name), structure.span(source.type_name)
     except StructureError:
         return []
-    if not np.array_equal(structure.sensor_uid[sensors], source.uid):
+    if not np.array_equal(structure.sensor_uid[together], source.uid):
         return []
     found = []
     for contact in frame:

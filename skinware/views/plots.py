@@ -250,10 +250,10 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot]
         if not some:
             return found
         values: Values = frame.values[at] * scale + offset
-        unknown = np.isnan(values) | ((frame.status[at] & _NO_VALUE) != 0)
+        values[(frame.status[at] & _NO_VALUE) != 0] = np.nan
         if len(some) == len(at) == len(lines):  # a sensor each
-            values[unknown] = np.nan
             return values
+        unknown = np.isnan(values)
         values[unknown] = 0
         of_lines = np.where(highest, np.maximum.reduceat(values, starts), np.add.reduceat(values, starts))
         of_lines[np.logical_and.reduceat(unknown, starts)] = np.nan

@@ -102,32 +102,37 @@ class ViewServer:
             close_timeout=_CLOSE_TIMEOUT_S,
             ssl=self._tls,
         )
-        following, stopping = asyncio.create_task(self._follow()), asyncio.create_task(stop.wait())
+        self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        stopping = asyncio.create_task(stop.wait())
         try:
+            self._follow()
             ready(int(next(iter(server.sockets)).getsockname()[1]))
-            await asyncio.wait({following, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait({self._failure, stopping}, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for task in (following, stopping):
-                task.cancel()
+            stopping.cancel()
+            self._timer.cancel()
             server.close()
             with contextlib.suppress(TimeoutError):  # of connections that stay silent
                 await asyncio.wait_for(server.wait_closed(), 2 * _CLOSE_TIMEOUT_S)
             await self._doctor.close()
             if self._recording is not None:
                 await self._recording.close()
-        if following.done() and not following.cancelled():
-            following.result()
+        if self._failure.done():
+            self._failure.result()
 
-    async def _follow(self) -> None:
-        """Follow the drivers while there are viewers, without end."""
-        while True:
+    def _follow(self) -> None:
+        """Take what is new while there are viewers, send turns that are due, and come again in time."""
+        try:
             pauses_s = [self._take(show) for show in {viewer.show for viewer in self._viewers}]
             if pauses_s:
                 problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
                 self._doctor.follow([problem for problem in problems if NOTE not in problem])
-                for viewer in self._viewers:
-                    self._send_due(viewer)
-            await asyncio.sleep(min(pauses_s, default=_TICK_S))
+                for viewer in filter(self._is_due, self._viewers):
+                    self._send(viewer)
+        except Exception as error:  # noqa: BLE001 - show() raises it
+            self._failure.set_exception(error)
+        else:
+            self._timer = asyncio.get_running_loop().call_later(min(pauses_s, default=_TICK_S), self._follow)
 
     def _take(self, show: Show) -> float:
         """Take what is new of a show for its viewers, and return the time until it is worth looking again, s."""
@@ -139,6 +144,8 @@ class ViewServer:
                 viewer.look.follow(driver)
             viewer.plots.take()
         show.follow()
+        if not any(viewer.wanted for viewer in viewers):  # a question comes first
+            return _LONGEST_S
         return min(max(period_s, _TICK_S), _LONGEST_S) if newer else _TICK_S
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -200,18 +207,20 @@ class ViewServer:
                 self._do(viewer, looks.operation_of(text))
             except ConfigurationError as error:
                 viewer.refuse(str(error))
-            self._send_due(viewer)
+            if self._is_due(viewer):
+                self._timer.cancel()
+                self._follow()
 
-    def _send_due(self, viewer: Viewer) -> None:
-        """Send a viewer its next turn if it waits for one, has taken the last one, and something is new."""
-        now_s, connection = time.monotonic(), self._viewers[viewer]
-        if not viewer.wanted or now_s < viewer.sent_s + 1 / viewer.look.fps - _EARLY_S:
-            return
-        if not viewer.has_news and now_s < viewer.sent_s + _LONGEST_TURN_S:
-            return
-        if not connection.transport.get_write_buffer_size():
-            viewer.wanted, viewer.sent_s = viewer.wanted - 1, now_s
-            broadcast([connection], viewer.turn(self._besides(viewer.show)))
+    def _is_due(self, viewer: Viewer) -> bool:
+        """Return whether a viewer waits for a turn, has taken the last one, and its pace allows the next."""
+        is_in_time = time.monotonic() >= viewer.sent_s + 1 / viewer.look.fps - _EARLY_S
+        return is_in_time and viewer.wanted > 0 and not self._viewers[viewer].transport.get_write_buffer_size()
+
+    def _send(self, viewer: Viewer) -> None:
+        """Send a viewer its next turn if something is new, or nothing has been for long."""
+        if viewer.has_news or time.monotonic() >= viewer.sent_s + _LONGEST_TURN_S:
+            viewer.wanted, viewer.sent_s = viewer.wanted - 1, time.monotonic()
+            broadcast([self._viewers[viewer]], viewer.turn(self._besides(viewer.show)))
 
     def _do(self, viewer: Viewer, operation: looks.Operation) -> None:
         match operation:

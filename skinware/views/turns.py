@@ -29,7 +29,7 @@ from skinware.views.tree import problem_of_all, problems_of, state_of, worst_fir
 
 PROTOCOL = "skinware.view.2"
 _ALIGNMENT = 8
-_STATE_EVERY_NS = NS_PER_S // 2
+_STATE_EVERY_NS = NS_PER_S
 _EXACT_EVERY_NS = NS_PER_S // 10
 """People read no more numbers."""
 _MOST_QUESTIONS = 64
@@ -79,7 +79,7 @@ class Viewer:
         self._edition = -1
         self._got: defaultdict[int, _Got] = defaultdict(_Got)  # by the driver's number
         self._state_due_ns = self._exact_due_ns = 0
-        self._lives: list[str] = []
+        self._known: list[Any] = []
         self._exact: list[tuple[int, int]] = []
         self._asked = False
         self._questions: list[looks.Names] = []
@@ -172,9 +172,10 @@ class Viewer:
         replays = self._of_replays()
         header |= {key: news for key, news in replays.items() if self._sent.get(key) != news}
         self._sent = replays
-        lives = [driver.life for driver in self._follower.drivers]
-        if now_ns() >= self._state_due_ns or lives != self._lives:
-            self._state_due_ns, self._lives = now_ns() + _STATE_EVERY_NS, lives
+        known = [besides["problems"], besides.get("marks"), besides["recording"] is None, self.show.problems]
+        known += [driver.life for driver in self._follower.drivers]
+        if now_ns() >= self._state_due_ns or known != self._known:
+            self._state_due_ns, self._known = now_ns() + _STATE_EVERY_NS, known
             header["state"] = besides | self._state(besides.get("problems", []))
         return blobs.under(header)
 

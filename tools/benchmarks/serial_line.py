@@ -34,7 +34,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from skinware import Namespace
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.bus import FrameBatch, wire_dtype
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.fields import Bits
 from skinware_drivers.layout import Frame, Layout, Values
@@ -43,7 +44,7 @@ from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
-from skinware_drivers.serial.framing import fill_rows
+from skinware_drivers.serial.stream import Stream, stream_of
 from tests.serial.framings import EXAMPLES
 from tests.specification.decoding import SpecifiedDecoder
 
@@ -94,33 +95,29 @@ def frames_of(name: str, total: int) -> tuple[bytes, int]:
 # In memory
 
 
+def fed(stream: Stream, data: bytes, chunk: int, batch: FrameBatch, empty: Callable[[], None]) -> Iterator[int]:
+    """The bytes into a stream, and its frames into the emptied batch: how many, again and again."""
+    for start in range(0, len(data), chunk):
+        stream.add(data[start : start + chunk], start)
+        while stream.is_behind:
+            empty()
+            yield stream.fill(batch, 0)
+
+
 def ours(name: str, stream: bytes, chunk: int) -> int:
     """Frames found and copied into rows of a batch."""
     framing = EXAMPLES[name].framing
-    framer = framing.framer()
-    rows = np.zeros(1 + min(chunk, len(stream)) // 16, wire_dtype(-(-framing.maximum_body // 8) * 8))
-    found = 0
-    for at in range(0, len(stream), chunk):
-        framed = framer.feed(stream[at : at + chunk])
-        fill_rows(rows[: len(framed)], framed)
-        found += len(framed)
-    return found
+    size = -(-framing.maximum_body // 8) * 8
+    batch = FrameBatch(1 + min(chunk, len(stream)) // 16, size)
+    return sum(fed(stream_of(framing, size, BusCounters()), stream, chunk, batch, batch.clear))
 
 
 def ours_decoded(stream: bytes, chunk: int) -> int:
     """Frames found, decoded and shown."""
-    decoder, framer = make_decoder(), FRAMING.framer()
-    batch = FrameBatch(chunk // 16, 64)
-    found = 0
-    for at in range(0, len(stream), chunk):
-        framed = framer.feed(stream[at : at + chunk])
-        decoder.put_back(batch)
-        rows = slice(batch.stop, batch.stop + len(framed))
-        fill_rows(batch.wire[rows], framed)
-        batch.time_ns[rows], batch.bus[rows] = at, 0
-        batch.stop = rows.stop
+    decoder, batch, found = make_decoder(), FrameBatch(chunk // 16, 64), 0
+    for count in fed(stream_of(FRAMING, 64, BusCounters()), stream, chunk, batch, lambda: decoder.put_back(batch)):
         decoder.state.show(decoder.decode(batch)[0])
-        found += len(framed)
+        found += count
     return found
 
 

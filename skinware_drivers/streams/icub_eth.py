@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Literal
 
 import msgspec
@@ -24,7 +24,8 @@ from skinware_drivers.serial.framing import Field, Framing
 from skinware_drivers.serial.framings import Split
 from skinware_drivers.serial.packets import Length, Packet
 
-_HEADER, _OVERHEAD, _LONGEST_DATAGRAM = 24, 28, 1500
+_HEADER, _NUMBER, _OVERHEAD, _LONGEST_DATAGRAM = 16, 8, 28, 1500
+_OVERTAKEN = 64
 _HEAD = struct.Struct("<BBHI")
 _SAY, _SIGNAL = 2, 4
 _TIME, _SIGNATURE, _VERSION = 0x04, 0x08, 0xC0
@@ -33,8 +34,21 @@ _ITEM, _LONGEST_CAN = 10, 8
 
 
 def rops(port: int) -> Split:
-    """Return the framing that finds the CAN frames of the skin on a CAN port, 1 or 2."""
-    return Split(_FRAMES, lambda _, operations: _can_frames(operations, _SKIN | (port - 1) << 8))
+    """Return the framing that finds the CAN frames of the skin on a CAN port, 1 or 2.
+
+    A frame that one of the next 64 has overtaken becomes one that is too long for CAN, and that the bus refuses.
+    """
+    newest = 0
+
+    def split(_: int, body: bytes) -> Iterable[tuple[int, bytes]]:
+        nonlocal newest
+        number = int.from_bytes(body[:_NUMBER], "little")
+        if 0 < newest - number <= _OVERTAKEN:
+            return [(0, bytes(_LONGEST_DATAGRAM))]
+        newest = number
+        return _can_frames(body[_NUMBER:], _SKIN | (port - 1) << 8)
+
+    return Split(_FRAMES, split)
 
 
 def _can_frames(operations: bytes, wanted: int) -> Iterator[tuple[int, bytes]]:

@@ -39,6 +39,17 @@ def test_the_second_skin_is_on_another_port() -> None:
     assert [len(rops(port).framer().feed(DATAGRAM)) for port in (1, 2)] == [2, 0]
 
 
+def test_an_overtaken_frame_becomes_one_that_the_bus_refuses() -> None:
+    framer = rops(1).framer()
+    found = [
+        framer.feed(DATAGRAM[:16] + number.to_bytes(8, "little") + DATAGRAM[24:]) for number in (9, 11, 10, 11, 12)
+    ]
+    assert [[len(frame.body) for frame in frames] for frames in found] == [[8, 8], [8, 8], [1500], [8, 8], [8, 8]]
+    assert len(framer.feed(DATAGRAM[:16] + bytes(8) + DATAGRAM[24:])[0].body) == 1500
+    framer.feed(DATAGRAM[:16] + bytes(6) + b"\1\0" + DATAGRAM[24:])
+    assert len(framer.feed(DATAGRAM[:16] + bytes(8) + DATAGRAM[24:])[0].body) == 8  # the board begins again
+
+
 @pytest.mark.parametrize(
     ("there", "instead", "frames"),
     [

@@ -39,6 +39,7 @@ class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
     speed_mbit_s = 100
     streams = "always"
     numbered_by = "boards"
+    _sent = 0
 
     def places(self) -> Places:
         return on_pads(*[(12, 4)] * self.options.triangles)
@@ -60,4 +61,5 @@ class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
             twelve = bytes(values[12 * triangle : 12 * triangle + 12])
             halves = {"head": b"\x40" + twelve[:7], "tail": b"\xc0" + twelve[7:] + b"\0\0"}
             records += [(can, data) for half, data in halves.items() if f"0x{can:03x}-{half}" not in self.silent]
-        return [datagram(self.options.skin, records, device.cycle, device.sampled_ns // 1000)]
+        self._sent += 1
+        return [datagram(self.options.skin, records, self._sent, device.sampled_ns // 1000)]

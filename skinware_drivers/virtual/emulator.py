@@ -108,6 +108,7 @@ class Emulator(Stage[OptionsT]):
         self._source = source
         self._press: dict[int, WanderingPress] = {}
         self._n_values = 0
+        self._eaches: dict[str, tuple[int | Sequence[int], npt.NDArray[np.int64]]] = {}
 
     # A subclass defines these
 
@@ -169,7 +170,7 @@ class Emulator(Stage[OptionsT]):
 
     def pressed(self, added: npt.NDArray[np.float64]) -> list[int]:
         """Return the values of a device whose sensors physics presses by so many counts."""
-        return self._in_range(each_value("rest", self.rest, len(added)) + np.rint(added).astype(np.int64))
+        return self._in_range(self._each("rest", len(added)) + np.rint(added).astype(np.int64))
 
     def burst(self, device: Device, time_ns: int) -> None:
         """Send the values that are felt now; faults happen here."""
@@ -211,12 +212,16 @@ class Emulator(Stage[OptionsT]):
         return listed
 
     def _in_range(self, felt: Sequence[int] | npt.NDArray[np.int64]) -> list[int]:
-        limits = (each_value(name, getattr(self, name), len(felt)) for name in ("lowest", "full_scale"))
-        values: list[int] = np.clip(felt, *limits).tolist()
+        limits = (self._each(name, len(felt)) for name in ("lowest", "full_scale"))
+        values: list[int] = np.minimum(np.maximum(felt, next(limits)), next(limits)).tolist()
         return values
 
-    def _each(self, name: str) -> npt.NDArray[np.int64]:
-        return each_value(name, getattr(self, name), self._n_values)
+    def _each(self, name: str, n_values: int | None = None) -> npt.NDArray[np.int64]:
+        n_values, given = self._n_values if n_values is None else n_values, getattr(self, name)
+        known = self._eaches.get(name)
+        if known is None or known[0] is not given or len(known[1]) != n_values:
+            known = self._eaches[name] = given, each_value(name, given, n_values)
+        return known[1]
 
 
 def each_value(name: str, given: int | Sequence[int], n_values: int) -> npt.NDArray[np.int64]:

@@ -22,6 +22,8 @@ _NEAREST = 4
 _SAME_WAY = 0.5
 """Cosine of the largest angle between a contact's normal and that of a taxel which feels it."""
 _EPSILON = 1e-9
+_CROSS = np.cross(np.eye(3)[:, np.newaxis], np.eye(3)).transpose(2, 0, 1)
+"""(3, 3, 3) of the cross product: of two vectors, by the sum over their products."""
 
 
 class Touching(NamedTuple):
@@ -71,6 +73,7 @@ class PhysicsScene:
         for number, module in enumerate(self.modules):
             self._feels[number, module.geoms] = True
         self._is_covered: npt.NDArray[np.bool_] = np.logical_or.reduce(self._feels)
+        self._covered: frozenset[int] = frozenset(np.flatnonzero(self._is_covered).tolist())
         self.actuators = Actuators(bound, self.model, self.data)
         self.joints: list[str] = names_of(self.model, mujoco.mjtObj.mjOBJ_JOINT, self.model.njnt)
         self._renderer: Any = None
@@ -103,7 +106,7 @@ class PhysicsScene:
             self.actuators.advance()
             mujoco.mj_step(self.model, self.data)
             self._touching = None
-            if not self._is_covered[self.data.contact.geom].any():
+            if not self.data.ncon or self._covered.isdisjoint(self.data.contact.geom.ravel().tolist()):
                 self.touched_s = math.nan
             elif math.isnan(self.touched_s):
                 self.touched_s = float(self.data.time) - step_s
@@ -127,8 +130,10 @@ class PhysicsScene:
 
     def touching(self) -> list[Touching]:
         if self._touching is None:
-            numbers, sides = np.nonzero(self._is_covered[self.data.contact.geom])
-            self._touching = self._touches(numbers, sides) if len(numbers) else []
+            self._touching = []
+            if self.data.ncon:
+                numbers, sides = np.nonzero(self._is_covered[self.data.contact.geom])
+                self._touching = self._touches(numbers, sides) if len(numbers) else []
         return self._touching
 
     def pressed_n(self) -> ArrayF:
@@ -173,20 +178,20 @@ class PhysicsScene:
 
     def _touches(self, numbers: npt.NDArray[np.intp], sides: npt.NDArray[np.intp]) -> list[Touching]:
         """Return the contacts of these numbers, each felt at one of its two sides, that are near a module's taxels."""
-        geom = self.data.contact.geom[numbers, sides]
-        other = self.data.contact.geom[numbers, 1 - sides]
-        place = self.data.contact.pos[numbers]
-        frame = self.data.contact.frame[numbers].reshape(-1, 3, 3)
+        contact, every = self.data.contact, np.arange(len(numbers))
+        pair = contact.geom[numbers]
+        geom, body = pair[every, sides], self.model.geom_bodyid[pair]
+        place, frame = contact.pos[numbers], contact.frame[numbers].reshape(-1, 3, 3)
+        own = body[every, sides]
         sign = np.where(sides == 0, -1.0, 1.0)[:, np.newaxis]
-        body = self.model.geom_bodyid[geom]
-        to_body = self.data.xmat[body].reshape(-1, 3, 3).transpose(0, 2, 1)
-        point = _turned(to_body, place - self.data.xpos[body])
-        outward = _turned(to_body, -sign * frame[:, 0])
         force = np.zeros((len(numbers), 6))
-        for row, number in enumerate(numbers):
+        for row, number in enumerate(numbers.tolist()):
             mujoco.mj_contactForce(self.model, self.data, number, force[row])
-        shear = sign * (force[:, 1:2] * frame[:, 1] + force[:, 2:3] * frame[:, 2])
-        slip = _turned(frame[:, 1:], self._velocities(other, place) - self._velocities(geom, place))
+        shear = force[:, 1:2] * frame[:, 1] + force[:, 2:3] * frame[:, 2]
+        vectors = np.stack([place - self.data.xpos[own], -sign * frame[:, 0], sign * shear], axis=1)
+        point, outward, shear = (vectors @ self.data.xmat[own].reshape(-1, 3, 3)).transpose(1, 0, 2)
+        first, second = self._velocities(body, place[:, np.newaxis]).transpose(1, 0, 2)
+        slip = _turned(frame[:, 1:], first - second)
         nearest, modules, rows = np.full(len(numbers), np.inf), [-1] * len(numbers), [np.empty(0)] * len(numbers)
         for number, (module, feels) in enumerate(zip(self.modules, self._feels[:, geom], strict=True)):
             felt = np.flatnonzero(feels)
@@ -196,20 +201,18 @@ class PhysicsScene:
             for row, of_row, reach in zip(felt.tolist(), distance, distance.min(axis=1).tolist(), strict=True):
                 if reach <= module.reach_m and reach < nearest[row]:
                     nearest[row], modules[row], rows[row] = reach, number, of_row
-        shear, slip = _turned(to_body, shear), np.sqrt((slip * slip).sum(axis=1))
+        slip = np.sqrt((slip * slip).sum(axis=1))
         return [
             Touching(module, point[row], outward[row], float(force[row, 0]), shear[row], float(slip[row]), rows[row])
             for row, module in enumerate(modules)
             if module >= 0
         ]
 
-    def _velocities(self, geoms: npt.NDArray[np.intp], place: ArrayF) -> ArrayF:
-        """Return (n, 3) velocities of geoms at places, m/s; all in the world's frame."""
-        body = self.model.geom_bodyid[geoms]
+    def _velocities(self, body: npt.NDArray[np.intp], place: ArrayF) -> ArrayF:
+        """Return (..., 3) velocities of bodies at places, m/s; all in the world's frame."""
         turning, moving = self.data.cvel[body, :3], self.data.cvel[body, 3:]
-        x, y, z = (place - self.data.subtree_com[self.model.body_rootid[body]]).T
-        u, v, w = turning.T
-        velocities: ArrayF = moving + np.stack([v * z - w * y, w * x - u * z, u * y - v * x], axis=1)
+        arm = place - self.data.subtree_com[self.model.body_rootid[body]]
+        velocities: ArrayF = moving + np.einsum("ijk,...j,...k", _CROSS, turning, arm)
         return velocities
 
 
@@ -240,13 +243,15 @@ def spread(taxels: BoundTaxels, depth_m: ArrayF, touches: Sequence[Touching]) ->
     Args:
         depth_m: (n,) by which the other bodies reach beyond each taxel.
     """
-    distance = np.stack([touch.distance_m for touch in touches], axis=1)
-    is_nearest = distance.argmin(axis=1)[:, np.newaxis] == np.arange(len(touches))
-    weight = np.where(is_nearest & np.isfinite(distance), np.maximum(0.0, depth_m)[:, np.newaxis], 0.0)
-    for number in np.flatnonzero(weight.sum(axis=0) == 0):
-        rows = np.argsort(distance[:, number])[:_NEAREST]
-        weight[rows, number] = 1 / (distance[rows, number] + 1e-6)
-    share = weight / weight.sum(axis=0)
+    distance = np.array([touch.distance_m for touch in touches])
+    nearest = distance.argmin(axis=0)
+    every = np.arange(len(nearest))
+    weight = np.zeros_like(distance)
+    weight[nearest, every] = np.where(np.isfinite(distance[nearest, every]), np.maximum(0.0, depth_m), 0.0)
+    for number in np.flatnonzero(weight.sum(axis=1) == 0).tolist():
+        rows = np.argsort(distance[number])[:_NEAREST]
+        weight[number, rows] = 1 / (distance[number, rows] + 1e-6)
+    share = (weight / weight.sum(axis=1)[:, np.newaxis]).T
     force_n = _turned(taxels.axes, share @ np.array([touch.shear_n for touch in touches]))
     force_n[:, 2] = share @ np.array([touch.normal_n for touch in touches])
     return force_n

@@ -92,10 +92,9 @@ class Stop(Protocol):
 class Emulation:
     """Emulated hardware on a bus.
 
-    Frames go out at the time they are due, rounded up to the millisecond of ``epoll``; those due together go out
-    together. No frame is dropped silently: a frame that a full queue refuses is sent again until half a second after it
-    was due, and then counted as a send failure. Frames of a time when the bus was down or this process
-    stopped are counted as ``unheard``.
+    Frames go out at the time they are due; those due together go out together. No frame is dropped silently: a frame
+    that a full queue refuses is sent again until half a second after it was due, and then counted as a send failure.
+    Frames of a time when the bus was down or this process stopped are counted as ``unheard``.
 
     Args:
         bus: not opened yet.
@@ -214,11 +213,9 @@ class Emulation:
 
 
 def wait_readable(descriptors: list[int], timeout_s: float | None) -> None:
-    poll = select.poll()
-    for descriptor in descriptors:
-        poll.register(descriptor, select.POLLIN)
+    """Wait to the microsecond: ``poll`` would round up to a millisecond."""
     with contextlib.suppress(InterruptedError):
-        poll.poll(None if timeout_s is None else timeout_s * 1000)
+        select.select(descriptors, [], [], timeout_s)
 
 
 _RATE_HZ = 50

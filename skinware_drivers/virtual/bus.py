@@ -38,8 +38,6 @@ from skinware_drivers.virtual.stage import Stage
 DEFAULT_EMULATOR = "roboskin"
 
 _AT_ONCE = 0
-_SHORTEST_SLEEP_NS = 4_000_000
-"""Shortest time between two wake-ups, so that frames come together as from a USB interface."""
 _LONGEST_BACKLOG_NS = 1_000_000_000
 """Frames and bytes that wait longer are dropped, as from a full receive buffer."""
 
@@ -164,7 +162,7 @@ class VirtualCanBus(EmulatedBus):
         if frames:
             self._append(batch, ordinal, frames)
             self.counters.frames += len(frames)
-        self._wake_when_due(now_ns + _SHORTEST_SLEEP_NS if batch.free else _AT_ONCE)
+        self._wake_when_due()
         return len(frames)
 
     def send(self, identifier: int, payload: bytes) -> None:
@@ -217,13 +215,13 @@ class VirtualCanBus(EmulatedBus):
             self.tap.keep_rows(batch.wire[batch.stop : stop], batch.time_ns[batch.stop : stop])
         batch.stop = stop
 
-    def _wake_when_due(self, rest_until_ns: int = _AT_ONCE) -> None:
-        """Become readable when a frame is due, but not before ``rest_until_ns``; at once while some wait."""
+    def _wake_when_due(self) -> None:
+        """Become readable when a frame is due; at once while some wait."""
         if self._pending:
             self._wake_at(_AT_ONCE)
             return
         self._due_ns = due_ns = self.hardware.next_due_ns()
-        self._wake_at(None if due_ns is None else max(due_ns, rest_until_ns))
+        self._wake_at(due_ns)
 
     def _wake_at(self, time_ns: int | None) -> None:
         if self._timer is not None:

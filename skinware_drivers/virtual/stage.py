@@ -300,10 +300,12 @@ class Stage(ABC, HasOptions[OptionsT]):
             self._foreign = ForeignTraffic(others, options.foreign_hz, random, queue, self.log, self.counts, now_ns)
 
     def _run_world(self, time_ns: int) -> None:
-        """Let the physics run on, and look at its commands, again and again."""
+        """Let the physics run on, and look at its commands, where no device has felt it lately; again and again."""
         if self.world is not None and self._now_ns is not None:
-            self.world.advance(time_ns)
-            self.schedule(max(time_ns + WORLD_NS, self._now_ns - _LONGEST_CATCH_UP_NS), self._run_world)
+            if time_ns >= self.world.advanced_ns + WORLD_NS:
+                self.world.advance(time_ns)
+            again_ns = max(self.world.advanced_ns + WORLD_NS, self._now_ns - _LONGEST_CATCH_UP_NS)
+            self.schedule(again_ns, self._run_world)
 
     def dying(self) -> Sequence[int]:
         """Return the devices that die at the time of the option ``dead_after_s``."""

@@ -155,6 +155,7 @@ class PhysicsWorld:
 
     Attributes:
         origin_ns: when the scene was at 0 s; later, once it has left time out.
+        advanced_ns: time of the devices of the newest call of ``advance``.
         left_out_s: time of the scene that it left out because nothing called it.
     """
 
@@ -182,7 +183,7 @@ class PhysicsWorld:
         """Begin at 0 s of the scene, with elastomers that feel and remember nothing."""
         self.scene.reset()
         self.origin_ns: int | None = None
-        self.left_out_s = 0.0
+        self.left_out_s, self.advanced_ns = 0.0, -NS_PER_S
         self._forces: list[ArrayF] | None = None
         self._transfers = [
             Transfer(self._bound.settings(module.binding), module.position_m, (seed, module.binding.device, number))
@@ -210,6 +211,7 @@ class PhysicsWorld:
             self.left_out_s += late_s
         if self.scene.step_to(self.since_s(time_ns)):
             self._forces = None
+        self.advanced_ns = time_ns
         if self._services is not None:
             self._services.serve(time_ns)
 

@@ -61,7 +61,8 @@ class Origin:
         namespaces = [namespace, *([] if calm is None else [calm])]
         self._contacts = [LiveSources[ContactsSample](each, ContactsReader) for each in namespaces]
         self._motion = [LiveSources[MotionSample](each, MotionReader) for each in namespaces]
-        self._services: list[LiveSources[Any]] = [*self._contacts, *self._motion]
+        self._services: list[LiveSources[Any] | LiveDrivers] = [*self._contacts, *self._motion]
+        self._services += [] if self._calm is None else [self._calm]
         self._look_ns = 0
 
     @property
@@ -72,7 +73,7 @@ class Origin:
     def look(self) -> list[LiveDriver]:
         if now_ns() >= self._look_ns:
             self._look_ns = now_ns() + LOOK_EVERY_NS // 2
-            for services in [*self._services, *([] if self._calm is None else [self._calm])]:
+            for services in self._services:
                 services.look()
         return self.live.look()
 
@@ -100,8 +101,6 @@ class Origin:
     def close(self) -> None:
         for services in self._services:
             services.close()
-        if self._calm is not None:
-            self._calm.close()
         self.live.close()
 
 

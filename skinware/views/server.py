@@ -102,12 +102,12 @@ class ViewServer:
             close_timeout=_CLOSE_TIMEOUT_S,
             ssl=self._tls,
         )
-        self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._failure: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
         stopping = asyncio.create_task(stop.wait())
         try:
             self._follow()
             ready(int(next(iter(server.sockets)).getsockname()[1]))
-            await asyncio.wait({self._failure, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait([self._failure, stopping], return_when=asyncio.FIRST_COMPLETED)
         finally:
             stopping.cancel()
             self._timer.cancel()

@@ -5,14 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-import threading
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 from pymodbus.constants import ExcCodes
 
 import skinware.recording
@@ -27,7 +24,7 @@ from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import running
 from tests.modbus.hands import FINGER_AT, Array
-from tests.modbus.peers import device, line, rtu_server, rtu_server_on, tcp_server
+from tests.modbus.peers import device, rtu_server, tcp_server
 from tests.modbus.rig import PYMODBUS, N, Palm, counted, driven, palm, until_right
 from tests.recording.rig import recording
 from tests.streams.peers import LOCAL, free_port, server
@@ -199,17 +196,6 @@ def test_a_server_that_answers_late_never_shifts_values(way: str) -> None:
             assert (frame.values[fresh] == right[fresh]).all()
 
 
-def test_two_programs_on_one_server() -> None:
-    with tcp_server(palm()) as name, driven(name) as (driving, reader):
-        host, port = name.removeprefix("modbus:tcp://").split(":")
-        with ModbusTcpClient(host, port=int(port)) as other:
-            for _ in range(50):
-                answer = other.read_holding_registers(FINGER_AT, count=10, device_id=1)
-                assert answer.registers == list(range(1000, 1010))
-        until_right(reader)
-        assert counted(driving)["refused"] == 0
-
-
 def test_a_driver_may_write_and_is_told_of_exceptions(over: Any) -> None:
     with over(palm()) as name, driven(name) as (_, reader):
         until_right(reader)
@@ -283,33 +269,6 @@ def test_what_cannot_be_sent_is_refused() -> None:
                 bus.send(unit, message)
         bus.close()
         assert bus.fileno() == -1
-
-
-# Listening
-
-
-def test_the_traffic_of_another_master_is_shown_and_nothing_is_sent() -> None:
-    stop = threading.Event()
-    with line() as between, rtu_server_on(between.other, palm()):
-
-        def ask() -> None:
-            with ModbusSerialClient(between.one, baudrate=115_200, timeout=1) as master:
-                while not stop.is_set():
-                    for first in range(0, N, 100):
-                        master.read_holding_registers(FINGER_AT + first, count=100, device_id=1)
-                    master.write_register(FINGER_AT + N - 1, 1000 + N - 1, device_id=1)
-                    time.sleep(0.005)
-
-        master = threading.Thread(target=ask)
-        master.start()
-        try:
-            with driven(f"modbus:{between.tap}?listen=yes", wait=False) as (driving, reader):
-                until_right(reader)
-                assert counted(driving)["sent"] == 0
-        finally:
-            stop.set()
-            master.join(30)
-        assert between.from_tap == b""
 
 
 # Commands

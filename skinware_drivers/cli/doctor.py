@@ -15,7 +15,7 @@ from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, overwrite, print_json, style
 from skinware.errors import BadRecording, ConfigurationError, MissingExtra
 from skinware.text import age_text, plural, wrapped
-from skinware_drivers.doctor.finding import Finding, Severity
+from skinware_drivers.doctor.rules import Finding, Severity
 
 if TYPE_CHECKING:
     from skinware_drivers.doctor.evidence import Evidence

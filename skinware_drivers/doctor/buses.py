@@ -6,8 +6,18 @@ from collections.abc import Iterator
 
 from skinware.text import age_text, count_text, plural, words
 from skinware_drivers.doctor.evidence import BusSeen, Change, Evidence
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.rules import RULES, brief, circumstances, loss_seen, names_of_bus
+from skinware_drivers.doctor.rules import (
+    RULES,
+    Finding,
+    Looked,
+    Note,
+    NotLooked,
+    Severity,
+    brief,
+    circumstances,
+    loss_seen,
+    names_of_bus,
+)
 from skinware_drivers.finding.running import same_bus
 from skinware_drivers.running.news import FULL, HIGH_LOAD
 

@@ -171,23 +171,20 @@ class DriverSeen:
 
 @dataclass(frozen=True)
 class NamespaceSeen:
-    """A namespace.
+    """The namespace to examine.
 
     Attributes:
-        is_ours: it is the one to examine.
         problem: the reason why it cannot be read; empty: it can.
         living, dead: names of services whose writer lives, and of those whose writer was killed.
     """
 
     name: str
     path: str
-    is_ours: bool
     problem: str = ""
     damaged: tuple[str, ...] = ()
     living: tuple[str, ...] = ()
     dead: tuple[str, ...] = ()
     bytes_of_dead: int = 0
-    idle_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -281,7 +278,7 @@ class Evidence:
     drivers: tuple[DriverSeen, ...]
     machine: MachineSeen
     recording: RecordingSeen | None = None
-    namespaces: tuple[NamespaceSeen, ...] = ()
+    files: NamespaceSeen | None = None
     interfaces: tuple[tuple[CanInterface, Counted], ...] = ()
     kernel_has_can: bool = True
     ports: tuple[SerialPort, ...] = ()

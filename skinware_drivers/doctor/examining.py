@@ -11,7 +11,7 @@ from skinware.memory.namespace import Namespace
 from skinware.text import printable
 from skinware_drivers.doctor import buses, machine, patches, programs
 from skinware_drivers.doctor.evidence import Evidence
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked
+from skinware_drivers.doctor.rules import Finding, Looked, Note, NotLooked
 
 CHECKS: dict[str, Callable[[Evidence], Iterator[Note]]] = {
     "interfaces": machine.check_interfaces,

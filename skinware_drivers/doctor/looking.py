@@ -20,7 +20,7 @@ from skinware.bridge_state import BridgeState
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.drivers import Drivers
-from skinware.errors import ConfigurationError, NamespaceError, Overrun, ServiceError, ServiceTimeout, StructureChanged
+from skinware.errors import NamespaceError, Overrun, ServiceError, ServiceTimeout, StructureChanged
 from skinware.memory.announcement import ReaderRecord, living_readers
 from skinware.memory.namespace import ROOT, Namespace
 from skinware.memory.ring import Sample
@@ -198,7 +198,6 @@ _PACKAGES = (
     "mcap",
     "zstandard",
 )
-_PREFIX = "skinware."
 _LIMITS = {
     "net.core.rmem_max": Path("/proc/sys/net/core/rmem_max"),
     "net.core.netdev_max_backlog": Path("/proc/sys/net/core/netdev_max_backlog"),
@@ -260,23 +259,12 @@ def versions() -> dict[str, str]:
     return found
 
 
-def namespaces_seen(ours: Namespace) -> tuple[NamespaceSeen, ...]:
-    """Return the namespaces of this machine, first ``ours``, even if it does not exist."""
-    names = {folder.name.removeprefix(_PREFIX) for folder in ROOT.glob(f"{_PREFIX}*")} - {ours.name}
-    found = [_namespace_seen(ours, is_ours=True)]
-    for name in sorted(names):
-        with contextlib.suppress(ConfigurationError):  # a folder whose name cannot be a namespace's
-            found.append(_namespace_seen(Namespace(name), is_ours=False))
-    return tuple(found)
-
-
-def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
+def namespace_seen(namespace: Namespace) -> NamespaceSeen:
     path = str(namespace.path)
     if not namespace.path.exists() and not namespace.path.is_symlink():
-        return NamespaceSeen(namespace.name, path, is_ours)
+        return NamespaceSeen(namespace.name, path)
     try:
         namespace.check()
-        idle_s = time.time() - namespace.path.stat().st_mtime
         with Drivers(namespace, partial(ServiceReader[Sample], announce=False)) as services:
             services.look()
             if services.trouble:
@@ -287,14 +275,14 @@ def _namespace_seen(namespace: Namespace, *, is_ours: bool) -> NamespaceSeen:
         files = [namespace.ring_path(name) for name in dead]
         size = sum(file.stat().st_size for file in files if file.exists())
     except (NamespaceError, OSError) as error:
-        return NamespaceSeen(namespace.name, path, is_ours, problem=str(error))
-    return NamespaceSeen(namespace.name, path, is_ours, "", damaged, living, dead, size, idle_s)
+        return NamespaceSeen(namespace.name, path, problem=str(error))
+    return NamespaceSeen(namespace.name, path, "", damaged, living, dead, size)
 
 
 def look(namespace: Namespace, seconds: float, progress: Callable[[float], object] = lambda _seconds: None) -> Evidence:
     machine, readers_before = MachineWatch(), _readers(namespace)
     counts_before = {one.name: _counts(one) for one in interfaces.can_interfaces()}
-    namespaces = namespaces_seen(namespace)
+    files = namespace_seen(namespace)
     drivers: tuple[DriverSeen, ...]
     try:
         drivers = watch(namespace, seconds, progress)
@@ -322,7 +310,7 @@ def look(namespace: Namespace, seconds: float, progress: Callable[[float], objec
         namespace=namespace.name,
         drivers=drivers,
         machine=machine.seen(),
-        namespaces=namespaces,
+        files=files,
         interfaces=tuple(interfaces_seen),
         kernel_has_can=interfaces.kernel_has_can(),
         ports=tuple(ports.serial_ports()),

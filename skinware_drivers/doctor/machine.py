@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 from skinware.text import count_text, plural, words
 from skinware_drivers.doctor.evidence import Counted, Evidence
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.rules import RULES
+from skinware_drivers.doctor.rules import RULES, Finding, Looked, Note, NotLooked, Severity
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.finding.running import RunningDriver, driver_on
@@ -105,13 +104,10 @@ def check_permissions(evidence: Evidence) -> Iterator[Note]:
     yield Looked("/dev/shm", machine.shared_problem or "may be written")
     if machine.shared_problem:
         yield RULES["machine"]["cannot-publish"].found("/dev/shm", machine.shared_problem)
-    for one in evidence.namespaces:
-        if one.is_ours and one.problem:
-            yield RULES["machine"]["namespace"].found(f"namespace {one.name}", one.problem, path=one.path)
-        elif one.is_ours:
-            yield Looked(f"namespace {one.name}", f"{one.path} may be read")
-        elif one.problem:
-            yield NotLooked(f"namespace {one.name}", one.problem)
+    if (one := evidence.files) is not None and one.problem:
+        yield RULES["machine"]["namespace"].found(f"namespace {one.name}", one.problem, path=one.path)
+    elif one is not None:
+        yield Looked(f"namespace {one.name}", f"{one.path} may be read")
     priority = f"up to {machine.realtime_priority}" if machine.realtime_priority else "none"
     yield Looked("real-time priority", f"{priority} without further rights (skin-driver --realtime)")
     locked = machine.locked_memory_bytes

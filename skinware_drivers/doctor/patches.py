@@ -11,8 +11,18 @@ import numpy as np
 from skinware.tactile.calibration.checking import check_file
 from skinware.text import age_text, count_text, plural, words
 from skinware_drivers.doctor.evidence import DriverSeen, Evidence, PatchSeen
-from skinware_drivers.doctor.finding import Finding, Looked, Note, NotLooked, Severity
-from skinware_drivers.doctor.rules import RULES, brief, has_operation, loss_seen, names_of_bus
+from skinware_drivers.doctor.rules import (
+    RULES,
+    Finding,
+    Looked,
+    Note,
+    NotLooked,
+    Severity,
+    brief,
+    has_operation,
+    loss_seen,
+    names_of_bus,
+)
 
 _TWICE = 1.6
 """Ratio to the updates of other patches: two boards have one address, or one has another period."""

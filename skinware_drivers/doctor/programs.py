@@ -8,9 +8,8 @@ from dataclasses import replace
 from skinware.bridge_state import as_data, summary
 from skinware.realtime import NS_PER_S
 from skinware.text import age_text, count_text, plural, rate_text
-from skinware_drivers.doctor.evidence import DriverSeen, Evidence, NamespaceSeen, RecordingSeen
-from skinware_drivers.doctor.finding import Finding, Looked, Note
-from skinware_drivers.doctor.rules import RULES, circumstances
+from skinware_drivers.doctor.evidence import DriverSeen, Evidence, RecordingSeen
+from skinware_drivers.doctor.rules import RULES, Finding, Looked, Note, circumstances
 
 _LATE_NS = 50_000_000
 """Age of data when it is published, from which it is late whatever its period."""
@@ -23,8 +22,6 @@ _LOST_SHARE = 0.05
 """Share of the snapshots that a link may skip without a note."""
 _MIB = 1 << 20
 _MOST_COMMANDS = 3
-_FORGOTTEN_S = 600.0
-"""Time after which another namespace without a living writer is called forgotten."""
 
 
 def check_timing(evidence: Evidence) -> Iterator[Note]:
@@ -134,46 +131,26 @@ def check_bridges(evidence: Evidence) -> Iterator[Note]:
 
 
 def check_files(evidence: Evidence) -> Iterator[Note]:
-    ours = [one for one in evidence.namespaces if one.is_ours]
-    others = [one for one in evidence.namespaces if not one.is_ours and not one.problem]
-    for namespace in ours:
+    namespace = evidence.files
+    if namespace is not None:
         where = f"namespace {namespace.name}"
         if not namespace.problem:
-            yield Looked(where, _services([namespace]))
+            services = plural(len(namespace.living), "service")
+            yield Looked(where, f"{services} alive, {len(namespace.dead)} dead")
         for error in namespace.damaged:
             yield RULES["file"]["unreadable"].found(where, error, path=namespace.path)
-    if others:
-        yield Looked(plural(len(others), "other namespace"), _services(others))
-    drivers = {driver.name for driver in evidence.drivers}  # killed ones are another finding
-    for namespace in ours:
+        drivers = {driver.name for driver in evidence.drivers}  # killed ones are another finding
         dead = [name for name in namespace.dead if name not in drivers]
         if dead:
             found = RULES["file"]["left"].found(
-                f"namespace {namespace.name}",
+                where,
                 f"{', '.join(dead)}: {namespace.bytes_of_dead / _MIB:.1f} MiB of shared memory",
                 files=plural(len(dead), "file"),
                 are="are" if len(dead) > 1 else "is",
             )
             yield replace(found, commands=tuple(f"rm {namespace.path}/{name}.ring" for name in dead[:_MOST_COMMANDS]))
-    forgotten = [one for one in others if one.dead and not one.living and one.idle_s > _FORGOTTEN_S]
-    if forgotten:
-        size = sum(one.bytes_of_dead for one in forgotten) / _MIB
-        some = forgotten[:_MOST_COMMANDS]
-        names = ", ".join(f"{one.name} (untouched for {age_text(one.idle_s * 1e9)})" for one in some)
-        found = RULES["file"]["forgotten"].found(
-            names + (" ..." if len(forgotten) > len(some) else ""),
-            f"{sum(len(one.dead) for one in forgotten)} services, none alive: {size:.1f} MiB of shared memory",
-            namespaces=plural(len(forgotten), "namespace"),
-            are="are" if len(forgotten) > 1 else "is",
-        )
-        yield replace(found, commands=tuple(f"skin-info --namespace {one.name}" for one in some))
     if evidence.recording is not None:
         yield from _recording(evidence.recording)
-
-
-def _services(namespaces: list[NamespaceSeen]) -> str:
-    living = plural(sum(len(one.living) for one in namespaces), "service")
-    return f"{living} alive, {sum(len(one.dead) for one in namespaces)} dead"
 
 
 def _recording(recording: RecordingSeen) -> Iterator[Note]:

@@ -1,11 +1,12 @@
-"""Make findings from the texts of ``rules.toml``, and find the words that they are filled in with."""
+"""Findings of the doctor, made from the texts of ``rules.toml``, and the words that these are filled in with."""
 
 from __future__ import annotations
 
 import contextlib
+import enum
 import shlex
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
@@ -13,11 +14,56 @@ from skinware.errors import ConfigurationError
 from skinware.text import age_text, count_text, plural
 from skinware_drivers.bus_names import BusName
 from skinware_drivers.doctor.evidence import Counted, DriverSeen, Evidence
-from skinware_drivers.doctor.finding import Finding, Severity
 from skinware_drivers.operations import operations_of
 from skinware_drivers.registry import load_driver
 
 _SLOW_GOVERNORS = ("powersave", "conservative", "userspace")
+
+
+class Severity(enum.IntEnum):
+    NOTE = 1
+    """It costs no data now."""
+    WARNING = 2
+    """It costs some data or time, did so, or soon may."""
+    ERROR = 3
+    """Data is missing or wrong."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong.
+
+    Attributes:
+        area: such as ``buses``; filled in by :func:`skinware_drivers.doctor.examining.examine`.
+        see: page and section of the documentation, below ``docs/``.
+    """
+
+    severity: Severity
+    area: str = field(default="", kw_only=True)
+    what: str
+    where: str
+    evidence: str
+    action: str
+    commands: tuple[str, ...] = ()
+    see: str = "troubleshooting.md"
+
+
+@dataclass(frozen=True)
+class Looked:
+    area: str = field(default="", kw_only=True)
+    what: str
+    seen: str
+
+
+@dataclass(frozen=True)
+class NotLooked:
+    area: str = field(default="", kw_only=True)
+    what: str
+    why: str
+    commands: tuple[str, ...] = ()
+
+
+Note = Finding | Looked | NotLooked
 
 
 @dataclass(frozen=True)

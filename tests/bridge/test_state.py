@@ -21,7 +21,7 @@ from skinware.errors import BadServiceFile
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Severity
+from skinware_drivers.doctor.rules import Severity
 from skinware_drivers.testing.waiting import wait_until
 from tests.bridge.rig import ROBOT, joined, publish, serving, structure
 from tests.doctor.rig import found, looked

@@ -12,8 +12,8 @@ import pytest
 from skinware import Namespace
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Finding, Severity
 from skinware_drivers.doctor.looking import look
+from skinware_drivers.doctor.rules import Finding, Severity
 from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip
 from tests.commands import running

@@ -10,8 +10,8 @@ from pathlib import Path
 from skinware import Namespace
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Finding
 from skinware_drivers.doctor.looking import look
+from skinware_drivers.doctor.rules import Finding
 from skinware_drivers.testing.waiting import wait_until
 
 SHORT_S = 0.4

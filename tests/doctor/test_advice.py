@@ -32,8 +32,7 @@ from skinware_drivers.doctor.evidence import (
     TaxelFault,
 )
 from skinware_drivers.doctor.examining import Examination, examine
-from skinware_drivers.doctor.finding import Finding
-from skinware_drivers.doctor.rules import RULES, Rule
+from skinware_drivers.doctor.rules import RULES, Finding, Rule
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.finding.running import RunningDriver
@@ -121,11 +120,7 @@ def ill_machine(seen: Evidence) -> Evidence:
             seen.machine, memory_bytes=100, memory_available_bytes=0,
             shared_bytes=100, shared_free_bytes=0, shared_problem="read-only", softnet_dropped=9, clock_set_s=9.0,
         ),
-        namespaces=(
-            NamespaceSeen("mine", "/dev/shm/skinware.mine", True, "", ("a.ring: bad",), (), ("a", "b")),
-            NamespaceSeen("mine", "/dev/shm/skinware.mine", True, "others may write it"),
-            NamespaceSeen("old", "/dev/shm/skinware.old", False, dead=("torso",), idle_s=7200.0),
-        ),
+        files=NamespaceSeen("mine", "/dev/shm/skinware.mine", "others may write it", ("a.ring: bad",), (), ("a", "b")),
         interfaces=tuple((one, counted(RULES["drop"])) for one in controllers),
         ports=tuple(ports),
         readers=(ReaderSeen("python3", 17, "torso", 5, 9),),

@@ -16,7 +16,7 @@ import pytest
 from skinware import BusReason, BusState, DriverWriter, Namespace, Status
 from skinware.realtime import now_ns
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Finding, Severity
+from skinware_drivers.doctor.rules import Finding, Severity
 from skinware_drivers.testing.driving import EmulatedSkin, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus

@@ -9,7 +9,7 @@ from skinware.sensor_types import FORCE, PRESSURE
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.doctor.driver_log import whole_lines
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Severity
+from skinware_drivers.doctor.rules import Severity
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.doctor.rig import SHORT_S, found, found_until, looked, of

@@ -20,8 +20,8 @@ from skinware.recording import Recording
 from skinware_drivers.doctor import recorded
 from skinware_drivers.doctor.evidence import Evidence
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Finding, Severity
 from skinware_drivers.doctor.recorded import look_at
+from skinware_drivers.doctor.rules import Finding, Severity
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill

@@ -11,10 +11,10 @@ import pytest
 
 from skinware import DriverReader, Namespace
 from skinware_drivers.doctor import looking
-from skinware_drivers.doctor.evidence import Evidence, MachineSeen, NamespaceSeen
+from skinware_drivers.doctor.evidence import Evidence, MachineSeen
 from skinware_drivers.doctor.examining import examine
-from skinware_drivers.doctor.finding import Finding, Severity
 from skinware_drivers.doctor.looking import look
+from skinware_drivers.doctor.rules import Finding, Severity
 from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanInterface, can_interfaces
 from skinware_drivers.finding.ports import serial_ports
@@ -162,21 +162,6 @@ def test_circumstances_are_the_evidence_of_what_they_cost() -> None:
 
 
 # -- namespaces and programs ----------------------------------------------------------------------------------------
-
-
-def test_namespaces_that_are_forgotten_foreign_or_no_namespaces(alone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (alone / "skinware.not a name").mkdir()
-    (alone / "skinware.file").touch()
-    told = looking.namespaces_seen(Namespace())
-    assert [one.is_ours for one in told] == [True] + [False] * (len(told) - 1)
-    old = NamespaceSeen("old", "/dev/shm/skinware.old", False, dead=("torso",), bytes_of_dead=1 << 20, idle_s=7200.0)
-    foreign = NamespaceSeen("lab", "/dev/shm/skinware.lab", False, problem="it belongs to somebody else")
-    young = dataclasses.replace(old, name="young", idle_s=10.0)
-    seen = evidence(namespaces=(*told, old, foreign, young))
-    (finding,) = findings(seen, "files")
-    assert (finding.severity, finding.commands) == (Severity.NOTE, ("skin-info --namespace old",))
-    assert "untouched for 120 min" in finding.where or "untouched for 2 h" in finding.where
-    assert ("namespace lab", foreign.problem) in {(one.what, one.why) for one in examine(seen).not_looked}
 
 
 def test_a_driver_that_has_found_no_board_is_told() -> None:

@@ -1,4 +1,4 @@
-"""Find contacts, touched taxels that hang together, measure them, and follow them from frame to frame."""
+"""Find contacts, touched taxels that hang together, measure them, and follow them from sample to sample."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
 from skinware.tactile.tracks import TouchedBlobs
 
 MOST = 64
-"""Most contacts of one frame; of more, those with the largest loads are kept."""
+"""Most contacts of one sample; of more, those with the largest loads are kept."""
 NO_CONTACT, BEYOND = -1, -2
 """Values of ``contact_of``: the taxel is not touched; it is in a contact for which there was no room."""
 
@@ -50,7 +50,7 @@ class Contact:
         velocity_m_s: (3,) m/s, velocity of the centre; NaN without places.
         kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
         slips: its pattern moves along the skin by more than noise and the change of its load explain.
-        provisional: only its last frames speak for it; the baseline has not confirmed it, and its load is 0.
+        provisional: only the last samples speak for it; the baseline has not confirmed it, and its load is 0.
         clipped: number of its taxels that are at the end of their range: load and force are too small.
         load_whole: estimate of the load with what threshold and clipping cut off, as of a bell; NaN if most is cut off.
         uncertainty: how much of the load could be noise or drift, in its unit; NaN if it is not known.
@@ -79,7 +79,7 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class ContactSet:
-    """All m contacts of one frame, the oldest first; a sequence of :class:`Contact`.
+    """All m contacts of one sample, the oldest first; a sequence of :class:`Contact`.
 
     Each attribute of a contact, but for ``taxels``, has an array (m, ...) here, with the dtype of :data:`COLUMNS`.
 
@@ -153,13 +153,13 @@ COLUMNS: Columns = {
     "uncertainty": ("<f4", (), None, "how much of the load could be noise or drift; NaN: not known"),
     "n": ("<u4", (), "", "number of its taxels"),
     "clipped": ("<u4", (), "", "number of its taxels that are at the end of their range"),
-    "cop_m": ("<f4", (3,), "m", "its centre, in its frame"),
+    "cop_m": ("<f4", (3,), "m", "its centre, in its coordinate frame"),
     "normal": ("<f4", (3,), "", "outwards, of length 1"),
     "velocity_m_s": ("<f4", (3,), "m/s", "of its centre"),
     "frame": ("<i2", (), "", "row of frame_name; -1: not known"),
     "kind": ("u1", (), "", "0: a touch, 1: a hold, 2: sliding"),
     "slips": ("u1", (), "", "1: its pattern moves by more than noise and load explain"),
-    "provisional": ("u1", (), "", "1: only its last frames speak for it, and its load is 0"),
+    "provisional": ("u1", (), "", "1: only the last samples speak for it, and its load is 0"),
 }
 """Dtype, shape, unit (None: that of the values) and meaning, per contact, of each array of a :class:`ContactSet`."""
 _VECTORS = [name for name, (_, shape, *_) in COLUMNS.items() if shape]
@@ -256,13 +256,13 @@ class Contacts:
         uncertainty: npt.NDArray[Any] | None = None,
         sigmas: npt.NDArray[Any] | None = None,
     ) -> ContactSet:
-        """Return the contacts of the next frame.
+        """Return the contacts of the next sample.
 
         Args:
             value: (n,) calmed values: 0 = no touch. Values below 0 or not finite count as 0.
             touched: (n,) bool, which taxels are touched.
-            time_ns: when the frame was acquired, CLOCK_MONOTONIC ns.
-            onset: (n,) bool, which taxels rose in the last frames: contacts of these alone are provisional.
+            time_ns: when the sample was acquired, CLOCK_MONOTONIC ns.
+            onset: (n,) bool, which taxels rose in the last samples: contacts of these alone are provisional.
             clipped: (n,) bool, which values are at the end of their range.
             uncertainty: (n,) how much of each value could be noise or drift.
             sigmas: (n,) by how many standard deviations of its noise each is above its baseline; NaN: not known. No

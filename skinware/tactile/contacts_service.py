@@ -1,4 +1,4 @@
-"""Publish and read the service ``contacts``: what touches a skin, frame by frame, for programs in any language.
+"""Publish and read the service ``contacts``: what touches a skin, sample by sample, for programs in any language.
 
 Columns of a sample: those of :data:`skinware.tactile.contacts.COLUMNS`, of 64 rows each. ``count`` of them are filled,
 the oldest contact first; in the others ``id``, ``n`` and ``kind`` are 0, ``frame`` is -1 and numbers are NaN.
@@ -49,7 +49,7 @@ _FORM = ServiceForm(NAME, ("driver", "type_name", "unit", "frames", "uid"), _col
 
 
 class ContactsSample(SourceSample):
-    """The contacts of one frame; iterate over it for each of them, the oldest first."""
+    """The contacts of one sample; iterate over it for each of them, the oldest first."""
 
     __slots__ = ("_contacts",)
 
@@ -160,7 +160,7 @@ class ContactsWriter(SourceWriter):
         super().__init__(_source(structure, type_name, driver, self._contacts), name, **options)
 
     def publish(self, value: npt.NDArray[Any], touched: Flags, acquired_ns: int, **more: Unpack[More]) -> ContactSet:
-        """Find the contacts of the next frame, and publish them.
+        """Find the contacts of the next sample, and publish them.
 
         Arguments as of :meth:`.Contacts.update`; raises ConfigurationError as that, and as ``begin``.
         """

@@ -12,17 +12,17 @@ from skinware.tactile.tracks import LONGEST_GUESS_S, Tracks, assign
 
 _STEPS = 4
 _SMALL = 1e-9
-_LOG_PEAK = 0.3  # spread of the logarithm of a peak from frame to frame
+_LOG_PEAK = 0.3  # spread of the logarithm of a peak from sample to sample
 _MISFIT = 0.1  # share of the largest value by which a response may differ from a bell
 _LEAST_VALUE = 1e-3  # share of the expected height: without any load (of a provisional touch) a fit has no solution
 _CLOSE_WIDTHS, _CLOSE_PITCHES, _CLOSE_WAYS = 1.3, 1.2, 1.5
-"""Two contacts meet when they come nearer than so many widths, pitches, or shares of their way in a frame."""
+"""Two contacts meet when they come nearer than so many widths, pitches, or shares of their way in a sample."""
 _APART = 1.15  # they have met when they are this many times as far apart
 _GOES_ON = 3.0  # log of the odds that two contacts kept on their ways, before anything else is known
 _WANDER = 0.1  # share of its way by which a contact leaves its lane
 _LOG_RATIO = 0.3  # spread of the logarithm of the ratio of two peaks, of contacts wider than a pitch
 _MOST_OF_LOAD = 2.0  # the most that a comparison of loads counts, as a log of odds
-_MOST_PAIRS = 16  # pairs that meet in a frame; more of them are noise
+_MOST_PAIRS = 16  # pairs that meet in a sample; more of them are noise
 _SETS_OFF_M_S, _FROM_PITCHES = 0.2, 1.5
 """m/s, and pitches: a new contact at least so fast that comes from so near where one has just gone is the same."""
 _EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")

@@ -88,6 +88,19 @@ def test_the_forces_on_taxels_are_those_of_the_solver(tmp_path: Path) -> None:
     assert forces[:, :2].sum(axis=0) == pytest.approx(touch.shear_n[:2], abs=1e-9)
 
 
+def test_many_steps_together_are_the_same_steps_one_by_one(tmp_path: Path) -> None:
+    together, apart = (pressed(pad(tmp_path), 3.0) for _ in range(2))
+    for scene, stops in ((together, 1), (apart, 10)):
+        scene.actuators.move({"x": 0.004}, 0.1)
+        begin_s = scene.time_s
+        for stop in range(1, stops + 1):
+            scene.step_to(begin_s + 0.1 * stop / stops)
+    assert np.array_equal(together.data.sensordata, apart.data.sensordata)
+    assert together.data.sensordata.any()
+    assert np.array_equal(together.newtons(), apart.newtons())
+    assert together.model.opt.disableflags == apart.model.opt.disableflags == 0
+
+
 def test_a_ball_that_slides_drags_the_taxels_with_it(tmp_path: Path) -> None:
     scene = pressed(pad(tmp_path), 3.0)
     scene.actuators.move({"x": 0.006}, 0.3)

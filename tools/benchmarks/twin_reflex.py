@@ -54,8 +54,8 @@ def commands(bus: str, period_ms: int, folder: Path, calm: str) -> list[tuple[st
     (folder / "gripper.toml").write_text(BINDING)
     world = f"mujoco:{folder / 'gripper.toml'}"
     profile = ("--realtime", f"fifo:{PRIORITY}") if os.geteuid() == 0 else ()
-    driver = "skin-driver", "--driver", "allegro_v5", "--model", "tips", "--period-ms", str(period_ms), "--latency", "0"
-    driver += profile
+    driver: tuple[str, ...] = ("skin-driver", "--driver", "allegro_v5", "--model", "tips", "--latency", "0")
+    driver += "--period-ms", str(period_ms), *profile
     rest = [
         ("skin-calm", "allegro_v5", "--into", calm),
         (sys.executable, str(ROOT / "examples" / "reflex.py"), calm, "joints"),

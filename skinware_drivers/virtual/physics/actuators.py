@@ -57,10 +57,14 @@ class Actuators:
         self._ramps.clear()
 
     def advance(self) -> None:
-        self._begin_moves()
+        if self._next_move < len(self._moves):
+            self._begin_moves()
+        if not self._ramps:
+            return
+        now_s, ctrl = self._data.time, self._data.ctrl
         for actuator, (begin_s, end_s, start, target) in list(self._ramps.items()):
-            share = 1.0 if self._data.time >= end_s else (self._data.time - begin_s) / (end_s - begin_s)
-            self._data.ctrl[actuator] = start + share * (target - start)
+            share = 1.0 if now_s >= end_s else (now_s - begin_s) / (end_s - begin_s)
+            ctrl[actuator] = start + share * (target - start)
             if share == 1.0:
                 del self._ramps[actuator]
 

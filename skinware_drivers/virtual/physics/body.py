@@ -22,6 +22,7 @@ _NEAREST = 4
 _SAME_WAY = 0.5
 """Cosine of the largest angle between a contact's normal and that of a taxel which feels it."""
 _EPSILON = 1e-9
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 _CROSS = np.cross(np.eye(3)[:, np.newaxis], np.eye(3)).transpose(2, 0, 1)
 """(3, 3, 3) of the cross product: of two vectors, by the sum over their products."""
 
@@ -99,10 +100,15 @@ class PhysicsScene:
         return float(self.data.time)
 
     def step_to(self, time_s: float) -> int:
-        """Step the physics to the last multiple of its time step by then; return the number of steps."""
-        step_s = self.model.opt.timestep
+        """Step the physics to the last multiple of its time step by then; return the number of steps.
+
+        MuJoCo computes its sensors in the last step alone.
+        """
+        option = self.model.opt
+        step_s, flags = option.timestep, option.disableflags
         steps = int((time_s - self.data.time) / step_s + 1e-6)
-        for _ in range(steps):
+        for left in reversed(range(steps)):
+            option.disableflags = flags | _NO_SENSORS if left else flags
             self.actuators.advance()
             mujoco.mj_step(self.model, self.data)
             self._touching = None

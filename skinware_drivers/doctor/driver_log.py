@@ -49,10 +49,13 @@ class _Growth:
         self.now: Numbers = counts.astype(np.int64)
         self.grown: Numbers = np.zeros_like(self.now)
 
-    def follow(self, counts: npt.NDArray[np.uint64]) -> None:
-        """Add the counters of the next snapshot; one that is smaller than before has begun at 0 again."""
+    def follow(self, counts: npt.NDArray[np.uint64], *, same_writer: bool) -> None:
+        """Add the counters of the next snapshot; one of another writer that is smaller has begun at 0 again.
+
+        Of the same writer, frames that were taken for lost have come after all.
+        """
         now = counts.astype(np.int64)
-        self.grown += np.where(now >= self.now, now - self.now, now)
+        self.grown += np.where(same_writer | (now >= self.now), now - self.now, now)
         self.now = now
 
     def counted(self, row: int) -> Counted:
@@ -84,8 +87,9 @@ class DriverLog:
         if before is None or self._buses is None or self._patches is None:
             self._buses, self._patches = _Growth(bus_names, bus_counts), _Growth(patch_names, patch_counts)
         else:
-            self._buses.follow(bus_counts)
-            self._patches.follow(patch_counts)
+            same_writer = before.generation == frame.generation
+            self._buses.follow(bus_counts, same_writer=same_writer)
+            self._patches.follow(patch_counts, same_writer=same_writer)
             self._follow_times(before, frame)
         self._load = np.maximum(self._load, np.where(frame.bus_load == 0xFFFF, 0, frame.bus_load))
         self._follow_states(frame, time_s)

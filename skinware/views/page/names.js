@@ -153,9 +153,10 @@ function partsOf(sheet, areSeveral) {
     const { name } = driver.patches[patch];
     const ownName = (module) => driver.modules[module].name.replace(`${name}, `, "");
     if (!areSeveral || patches.size > 1) parts.push(part(2, name, modules));
-    if (modules.length > 1) parts.push(...modules.map((module) => part(0, ownName(module), [module])));
-    for (const [finger, pads] of groups(modules, (module) => fingerOf(ownName(module)))) {
-      if (finger && pads.length > 1 && pads.length < modules.length) parts.push(part(1, finger, pads));
+    const pads = modules.filter((module) => taxels.get(module).length > 1 || !isNumbered(ownName(module)));
+    if (modules.length > 1) parts.push(...pads.map((module) => part(0, ownName(module), [module])));
+    for (const [finger, its] of groups(modules, (module) => fingerOf(ownName(module)))) {
+      if (finger && its.length > 1 && its.length < modules.length) parts.push(part(1, finger, its));
     }
   }
   return parts;

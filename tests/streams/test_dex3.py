@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
@@ -185,20 +184,6 @@ def test_a_sample_of_the_right_type_with_another_number_of_motors(
     with driven(domain, hands="left") as skin, robot(domain, "--hands", "left", "--motors", "6"):
         read_until(skin.reader, lambda f: skin.reader.bus_counters(f)[0]["bad_length"] > 5)
         assert "left hand: 6 motors and" in caplog.text
-
-
-def test_nothing_is_published(domain: int) -> None:
-    ours = DomainParticipant(domain)
-    publications = BuiltinDataReader(ours, BuiltinTopicDcpsPublication)
-    subscriptions = BuiltinDataReader(ours, BuiltinTopicDcpsSubscription)
-    edition = Edition()
-    writer = DataWriter(ours, Topic(ours, "rt/dex3/left/state", edition.hand))
-    with driven(domain, hands="left") as skin:
-        wait_until(lambda: writer.get_publication_matched_status().current_count == 1)
-        read_until(skin.reader, lambda frame: writer.write(edition.sample(0, 0)) or is_good(frame))
-        read = {one.topic_name for one in subscriptions.take(100) if not one.topic_name.startswith("DCPS")}
-        assert read == {"rt/dex3/left/state"}
-        assert {one.participant_key for one in publications.take(100)} == {ours.guid}
 
 
 def _swapped(sample: bytes, size: int) -> bytes:

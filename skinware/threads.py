@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from skinware.errors import Closed, Overrun, ServiceTimeout, StructureChanged
 from skinware.memory.ring import Sample
-from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, Profile, now_ns
+from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
 from skinware.service import ServiceReader, Writer
 from skinware.skin import Skin
 from skinware.snapshot import Snapshot
@@ -45,7 +45,6 @@ class Worker(Generic[T]):
         owned: what it works on; closed when the thread ends.
         items: what the function is called with.
         function: called in the thread; if it raises, the worker ends (``error``).
-        profile: how the thread is scheduled.
     """
 
     def __init__(
@@ -54,13 +53,11 @@ class Worker(Generic[T]):
         owned: ServiceReader[Any] | Writer | Skin,
         items: Callable[[], Iterator[T]],
         function: Callable[[T], object],
-        profile: Profile | None = None,
     ) -> None:
         self.error: BaseException | None = None
         self._owned = owned
         self._items = items
         self._function = function
-        self._profile = profile
         self._running = threading.Event()
         self._running.set()
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
@@ -98,8 +95,6 @@ class Worker(Generic[T]):
 
     def _work(self) -> None:
         try:
-            if self._profile is not None:
-                self._profile.apply()
             for item in self._items():
                 if not self._running.is_set():
                     self._running.wait()
@@ -126,7 +121,6 @@ def start_reader(
     *,
     rate_hz: float | None = None,
     in_order: bool = False,
-    profile: Profile | None = None,
 ) -> Worker[F]:
     """Start a thread that calls a function with the samples of a service.
 
@@ -138,7 +132,6 @@ def start_reader(
         function: called with each sample, a private copy.
         rate_hz: None: each time the writer publishes; otherwise at this rate with what is newest.
         in_order: every sample instead of the newest.
-        profile: how the thread is scheduled.
     """
 
     def samples() -> Iterator[F]:
@@ -151,7 +144,7 @@ def start_reader(
             except Overrun:  # the reader has counted it
                 time.sleep(_REST_AFTER_OVERRUN_S)
 
-    return Worker(f"reader of {reader.name}", reader, samples, function, profile)
+    return Worker(f"reader of {reader.name}", reader, samples, function)
 
 
 def start_writer(
@@ -160,7 +153,6 @@ def start_writer(
     *,
     rate_hz: float | None = None,
     from_last: bool = False,
-    profile: Profile | None = None,
 ) -> Worker[dict[str, npt.NDArray[Any]]]:
     """Start a thread that calls a function to fill each sample of a service.
 
@@ -169,7 +161,6 @@ def start_writer(
         function: called with the arrays of the next sample, to be filled in place.
         rate_hz: at this rate; None: whenever a program asks for a sample.
         from_last: the arrays hold the newest sample first.
-        profile: how the thread is scheduled.
     """
 
     def samples() -> Iterator[dict[str, npt.NDArray[Any]]]:
@@ -178,7 +169,7 @@ def start_writer(
         return writer.periodic(rate_hz, from_last=from_last)
 
     writer.request_server()  # programs may ask from now on
-    return _WriterWorker(f"writer of {writer.name}", writer, samples, function, profile)
+    return _WriterWorker(f"writer of {writer.name}", writer, samples, function)
 
 
 class _WriterWorker(Worker[dict[str, npt.NDArray[Any]]]):
@@ -209,7 +200,6 @@ class SkinReplica(Worker[Snapshot]):
         skin: used only by the thread from now on.
         function: called in the thread with each new snapshot.
         rate_hz: None: each time a driver publishes; otherwise at this rate.
-        profile: how the thread is scheduled.
     """
 
     def __init__(
@@ -218,7 +208,6 @@ class SkinReplica(Worker[Snapshot]):
         function: Callable[[Snapshot], object] = lambda _: None,
         *,
         rate_hz: float | None = None,
-        profile: Profile | None = None,
     ) -> None:
         self._snapshot: Snapshot | None = None
         self._news = threading.Condition()
@@ -230,7 +219,7 @@ class SkinReplica(Worker[Snapshot]):
                 self._news.notify_all()
             function(snapshot)
 
-        super().__init__("replica of the skin", skin, lambda: skin.samples(rate_hz), keep, profile)
+        super().__init__("replica of the skin", skin, lambda: skin.samples(rate_hz), keep)
 
     @property
     def snapshot(self) -> Snapshot | None:

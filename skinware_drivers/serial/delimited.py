@@ -83,12 +83,11 @@ class Cobs(Stuffing):
 
 
 class Escaped(Stuffing):
-    """Some bytes are replaced by an escape byte and another byte.
+    """Some bytes are replaced by an escape byte and another byte; frames also begin with a delimiter.
 
     Args:
         sent: the byte behind the escape byte, for each byte that a sender replaces.
         accepted: further replacements that a receiver accepts.
-        opening: frames begin with a delimiter too.
 
     Attributes:
         meaning: the byte that each byte behind the escape byte stands for.
@@ -100,12 +99,9 @@ class Escaped(Stuffing):
         escape: int,
         sent: Mapping[int, int],
         accepted: Mapping[int, int] | None = None,
-        *,
-        opening: bool = True,
     ) -> None:
         self.delimiter = delimiter
         self.escape = escape
-        self._opening = bytes([delimiter] * opening)
         self._sent = [(escape, sent[escape]), *((byte, code) for byte, code in sent.items() if byte != escape)]
         self.meaning = {code: byte for byte, code in {**(accepted or {}), **sent}.items()}
 
@@ -115,7 +111,7 @@ class Escaped(Stuffing):
     def encode(self, content: bytes) -> bytes:
         for byte, code in self._sent:  # the escape byte first
             content = content.replace(bytes([byte]), bytes([self.escape, code]))
-        return self._opening + content + bytes([self.delimiter])
+        return bytes([self.delimiter]) + content + bytes([self.delimiter])
 
 
 LINES = Lines()

@@ -6,9 +6,8 @@ everything before it that is in no catalogue. A response has the number of its c
 Data come as command 0 without a status: time in ms u32 LE, flags u8, cells u16 LE.
 
 Not known: the payload of tare, which is sent empty unless the option ``tare_payload`` gives one; ksatyaki/wts_driver
-82c46ac (2016-09-01) declares tare and untare as one command with a truth value, and implements neither. The meaning of
-system information: the operation ``system`` returns its bytes. Run-length coded data, which are documented for another
-device only, are not requested.
+82c46ac (2016-09-01) declares tare and untare as one command with a truth value, and implements neither. Run-length
+coded data, which are documented for another device only, are not requested.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ class WeissAdapter(SerialAdapter[OptionsT]):
         return cls.answers.result(command, reply.payload, size)
 
 
-_DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE, _SYSTEM = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46, 0x50
+_DATA, _START, _STOP, _TARE, _MATRIX, _TEMPERATURE = 0x00, 0x21, 0x22, 0x23, 0x30, 0x46
 _HEADER = 5
 _MOST_CELLS = 1024
 _RLE = 1
@@ -159,11 +158,6 @@ class WeissWtsDriver(WeissAdapter[WeissWtsOptions]):
         """Return the temperature of the sensor, degrees Celsius."""
         answer = await self._ask(link, _TEMPERATURE, size=2)
         return int.from_bytes(answer[:2], "little", signed=True) / 10
-
-    @operation(looks=True)
-    async def system(self, link: Link, patches: Sequence[Patch]) -> str:  # noqa: ARG002
-        """Return the system information of the sensor: bytes in hexadecimal, whose meaning is not public."""
-        return (await self._ask(link, _SYSTEM)).hex(" ")
 
     @classmethod
     async def _ask_cells(cls, link: Link, *, tries: int | None = None) -> tuple[int, ...]:

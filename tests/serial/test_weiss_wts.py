@@ -51,7 +51,6 @@ def test_a_sensor_that_streams_already_and_its_operations() -> None:
         assert frame.structure.types[0].maximum == 4095
         assert len(set(frame.values.tolist())) == 1
         assert reader.call("temperature") == {"bus0": 25.3}
-        assert reader.call("system") == {"bus0": "04 01 00 10 2a 00"}
         frame = read_until(reader, lambda f: int(f.values[0]) > 20)
 
         def behind_ns(later: DriverSnapshot) -> int:

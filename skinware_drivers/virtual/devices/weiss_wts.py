@@ -14,7 +14,7 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 BEGIN = b"\xaa\xaa\xaa"
-_NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, 0x50: 0}  # bytes of arguments
+_NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0}  # bytes of arguments
 _OK, _BAD_CHECKSUM, _TOO_SHORT, _UNKNOWN = 0, 11, 13, 14
 
 
@@ -94,8 +94,6 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
             return _OK, struct.pack("<5H", self.options.columns, self.options.rows, 340, 340, self.full_scale)
         if number == 0x46:
             return _OK, struct.pack("<h", 253)
-        if number == 0x50:
-            return _OK, bytes.fromhex("04 01 00 10 2a 00")
         if number == 0x23:
             device.memory["tare"] = True
         elif number == 0x22:

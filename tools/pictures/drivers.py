@@ -84,7 +84,7 @@ SHOWN: Mapping[str, Shown] = {
     "weiss_dsa": _pty(),
     "weiss_wts": _pty("--columns", "4", "--rows", "8"),
     "wuji_glove": _pty(),
-    "xela": Shown(address="mode=change"),
+    "xela": Shown("virtual?calm_s=6", address="mode=change"),
     "xela_server": Shown(),
     "yarp": Shown(),
 }

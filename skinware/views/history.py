@@ -119,14 +119,10 @@ class RecentValues:
         rows = self._rows()
         return self._time_ns[rows], self._values[rows, position]
 
-    def noise(self, positions: list[int]) -> npt.NDArray[np.float64]:
-        """Return (k,) float64, standard deviation of raw values from snapshot to snapshot; NaN before the third."""
-        rows = self._rows()
-        if len(rows) < 3:
-            return np.full(len(positions), np.nan)
-        values = self._values[np.ix_(rows, np.array(positions, np.int64))].astype(np.float64)
-        noise: npt.NDArray[np.float64] = np.diff(values, axis=0).std(axis=0) / np.sqrt(2)
-        return noise
+    def noise(self, position: int) -> float:
+        """Return the standard deviation of raw values of a sensor between snapshots; NaN before the third."""
+        values = self.series(position)[1].astype(np.float64)
+        return float(np.diff(values).std()) / math.sqrt(2) if len(values) > 2 else math.nan
 
     def _rows(self) -> npt.NDArray[np.int64]:
         rows = np.arange(max(0, self._count - _FRAMES), self._count) % _FRAMES

@@ -91,13 +91,13 @@ class Viewer:
         match operation:
             case looks.Choose():
                 self.look.choose(operation)
-                self._see_all_again()
+                self._got.clear()
             case looks.Tare():
                 self.look.tare()
-                self._see_all_again()
+                self._got.clear()
             case looks.Wipe():
                 self.look.wipe(operation.action == "start")
-                self._see_all_again()
+                self._got.clear()
             case looks.Exact():
                 self._exact, self._asked = operation.sensors, True
             case looks.Plot():
@@ -139,7 +139,7 @@ class Viewer:
         if self._edition != self._follower.edition:
             self._edition = self._follower.edition
             header["skin"] = self._skin(blobs)
-            self._see_all_again()
+            self._got.clear()
         pictures = []
         for driver in self._follower.drivers:
             if self._got[driver.number].change != _seen(driver):
@@ -181,9 +181,6 @@ class Viewer:
 
     def _of_replays(self) -> dict[str, Any]:
         return {"replays": self.show.replays, "outlines": self.show.outlines}
-
-    def _see_all_again(self) -> None:
-        self._got.clear()
 
     def _skin(self, blobs: Blobs) -> dict[str, Any]:
         follower, scene = self._follower, self._follower.scene
@@ -291,7 +288,7 @@ class Viewer:
             "value": of_type.offset + of_type.scale * raw,
             "raw": raw,
             "age_ms": round((now_ns() - time_ns) / 1e6, 3) if time_ns else None,
-            "noise": abs(of_type.scale) * float(driver.past.noise([position])[0]),
+            "noise": abs(of_type.scale) * driver.past.noise(position),
             "status": int(driver.newest.marked[position]),
             "why": why_text(int(driver.newest.why[position])),
             "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),

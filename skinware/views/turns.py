@@ -73,17 +73,17 @@ class Viewer:
 
     def __init__(self, show: Show) -> None:
         self.look, self.wanted, self.sent_s = looks.Look(), 0, 0.0
-        self.show, self._follower = show, show.follower
+        self.show = show
         self._sent: dict[str, Any] = {}  # of the replays
         self._number = 0
         self._edition = -1
         self._got: defaultdict[int, _Got] = defaultdict(_Got)  # by the driver's number
-        self._state_due_ns = self._exact_due_ns = 0
+        self._state_due_ns = 0
+        self._exact_due_ns: int | None = None  # 0: they are asked for
         self._known: list[Any] = []
         self._exact: list[tuple[int, int]] = []
-        self._asked = False
         self._questions: list[looks.Names] = []
-        self.plots = RecordedPlots(self._follower, show.played) if show.played else Plots(self._follower)
+        self.plots = RecordedPlots(self.show.follower, show.played) if show.played else Plots(self.show.follower)
         self._error: str | None = None
 
     def obey(self, operation: looks.Operation) -> bool:
@@ -99,7 +99,7 @@ class Viewer:
                 self.look.wipe(operation.action == "start")
                 self._got.clear()
             case looks.Exact():
-                self._exact, self._asked = operation.sensors, True
+                self._exact, self._exact_due_ns = operation.sensors, 0
             case looks.Plot():
                 self.plots.choose(operation.number, operation.lines, self._edition)
             case looks.Names() if len(self._questions) == _MOST_QUESTIONS:
@@ -118,13 +118,13 @@ class Viewer:
     @property
     def has_news(self) -> bool:
         return (
-            self._asked
+            self._exact_due_ns == 0
             or bool(self._questions)
             or self.plots.has_news
             or self._error is not None
-            or self._edition != self._follower.edition
+            or self._edition != self.show.follower.edition
             or self._sent != self._of_replays()
-            or any(self._got[driver.number].change != _seen(driver) for driver in self._follower.drivers)
+            or any(self._got[driver.number].change != _seen(driver) for driver in self.show.follower.drivers)
         )
 
     def turn(self, besides: dict[str, Any]) -> bytes:
@@ -136,20 +136,20 @@ class Viewer:
         self._number += 1
         blobs = Blobs()
         header: dict[str, Any] = {"turn": self._number, "now_ns": str(now_ns())}
-        if self._edition != self._follower.edition:
-            self._edition = self._follower.edition
+        if self._edition != self.show.follower.edition:
+            self._edition = self.show.follower.edition
             header["skin"] = self._skin(blobs)
             self._got.clear()
         pictures = []
-        for driver in self._follower.drivers:
+        for driver in self.show.follower.drivers:
             if self._got[driver.number].change != _seen(driver):
                 self._got[driver.number].change = _seen(driver)
                 shown = self._picture(driver, blobs)
                 pictures += [shown] if shown is not None else []
         if pictures:
             header |= {"pictures": pictures, "mode": self.look.mode}
-        if self._asked or (self._exact and now_ns() >= self._exact_due_ns):
-            self._asked, self._exact_due_ns = False, now_ns() + _EXACT_EVERY_NS
+        if self._exact_due_ns is not None and now_ns() >= self._exact_due_ns:
+            self._exact_due_ns = now_ns() + _EXACT_EVERY_NS if self._exact else None
             header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
         if self._questions:
             header |= self._answer(self._questions.pop(0))
@@ -173,7 +173,7 @@ class Viewer:
         header |= {key: news for key, news in replays.items() if self._sent.get(key) != news}
         self._sent = replays
         known = [besides["problems"], besides.get("marks"), besides["recording"] is None, self.show.problems]
-        known += [driver.life for driver in self._follower.drivers]
+        known += [driver.life for driver in self.show.follower.drivers]
         if now_ns() >= self._state_due_ns or known != self._known:
             self._state_due_ns, self._known = now_ns() + _STATE_EVERY_NS, known
             header["state"] = besides | self._state(besides.get("problems", []))
@@ -183,7 +183,7 @@ class Viewer:
         return {"replays": self.show.replays, "outlines": self.show.outlines}
 
     def _skin(self, blobs: Blobs) -> dict[str, Any]:
-        follower, scene = self._follower, self._follower.scene
+        follower, scene = self.show.follower, self.show.follower.scene
         of_live = [origin for origin in follower.origins if origin.recording is None]
         namespaces = [n for origin in of_live for n in (origin.namespace, origin.calm) if n is not None]
         return {
@@ -250,10 +250,10 @@ class Viewer:
     def _touched(self, driver: ShownDriver, quantity: Quantity, frame: ContactsSample | None) -> list[dict[str, Any]]:
         if frame is None or frame.source.type_name != quantity.type.name:
             return []
-        laid_out = self._follower.scene.of(driver.name, quantity.name).position
+        laid_out = self.show.follower.scene.of(driver.name, quantity.name).position
         contacts = []
         for contact, unit, sensor, _ in places_of(frame, driver.structure):
-            pose = self._follower.scene.pose(driver.name, contact.frame)
+            pose = self.show.follower.scene.pose(driver.name, contact.frame)
             position, normal = pose[:3, :3] @ contact.cop_m + pose[:3, 3], pose[:3, :3] @ contact.normal
             if not np.isfinite(position).all():  # without places: in the middle of its taxels as they are laid out
                 position = laid_out[contact.taxels].mean(axis=0, dtype=np.float64)
@@ -275,7 +275,7 @@ class Viewer:
 
     def _exactly(self, number: int, position: int) -> dict[str, Any] | None:
         """Return the exact value of a sensor; None for one that does not exist (any more)."""
-        driver = self._follower.get(number)
+        driver = self.show.follower.get(number)
         if driver is None or driver.newest is None or position >= driver.structure.n_sensors:
             return None
         frame, structure = driver.newest.frame, driver.structure
@@ -295,7 +295,7 @@ class Viewer:
         }
 
     def _answer(self, question: looks.Names) -> dict[str, Any]:
-        driver = self._follower.get(question.driver)
+        driver = self.show.follower.get(question.driver)
         quantity = None if driver is None else driver.quantity(question.type)
         if driver is None or quantity is None:
             self.refuse(f"no {question.type!r} of a driver {question.driver}")
@@ -304,10 +304,10 @@ class Viewer:
         return {"names": {"driver": driver.number, "type": quantity.name, "of": names}}
 
     def _state(self, problems: list[dict[str, Any]]) -> dict[str, Any]:
-        texts = self.show.problems + ([] if self._follower.problem is None else [self._follower.problem])
+        texts = self.show.problems + ([] if self.show.follower.problem is None else [self.show.follower.problem])
         problems = [*problems, *map(problem_of_all, texts)]
         drivers = []
-        for driver in self._follower.drivers:
+        for driver in self.show.follower.drivers:
             report = driver.report()
             drivers.append(state_of(driver, report))
             problems = problems + problems_of(driver, report)

@@ -137,7 +137,7 @@ def test_nothing_wrong_is_shown_from_a_line_that_loses_damages_and_repeats(hand:
     def has_seen_enough(frame: DriverSnapshot) -> bool:
         assert np.array_equal(frame.values, hand.right)
         counts = counted(driving)
-        return counts["refused"] and min(counts["polls_unanswered"], counts["checksum_errors"]) >= 3
+        return bool(counts["refused"]) and min(counts["polls_unanswered"], counts["checksum_errors"]) >= 3
 
     with line() as between, rtu_server_on(between.other, hand.server(), baudrate=BAUDRATE):
         name = f"modbus:{between.one}?baudrate={BAUDRATE}&timeout_ms=100"

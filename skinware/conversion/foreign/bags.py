@@ -130,7 +130,7 @@ def _bound_rosbags() -> None:
 
     ros1.decompressors.update(bz2=_bounded(bz2.BZ2Decompressor), lz4=lz4)
     mcap.DECOMPRESSORS.update(zstd=zstd, lz4=lz4)
-    ros2.zstd = SimpleNamespace(open=opened, decompress=zstd)
+    ros2.zstd = SimpleNamespace(open=opened, decompress=zstd)  # type: ignore[attr-defined]
 
 
 def _bounded(make: Callable[[], Any]) -> Callable[..., bytes]:

@@ -98,7 +98,7 @@ typedef enum skinware_result {
 #define SKINWARE_STATE_SUPERSEDED 2u /* a newer generation exists under the same name */
 #define SKINWARE_STATE_CLOSED 4u     /* the writer closed it in good order */
 
-/* Bits of a sensor's status (column "status" of a driver); 0 means fresh and good. Treat unknown bits as "not good". */
+/* Bits of a sensor's status (column "status" of a driver); 0: good when it was published. Treat unknown bits as "not good". */
 #define SKINWARE_STATUS_NEVER_SEEN 1u     /* no value since the driver started; the value is meaningless */
 #define SKINWARE_STATUS_STALE 2u          /* older than the patch's last update, or the patch went silent */
 #define SKINWARE_STATUS_OUT_OF_RANGE 4u   /* the true value is beyond the measuring range */

@@ -141,13 +141,13 @@ def check_rows(folder: Path, name: str, busy: int) -> None:
         before_ns = time_ns - (acquired_ns[equal] + age_ns[row])  # if it was this frame
         possible = np.flatnonzero((before_ns > -TIE_NS) & (before_ns < LONGEST_NS))
         assert len(possible), f"{name}, row {row}: its age is {before_ns / 1e6} ms off"
-        nearest = nearest_so_far(acquired_ns, series.published_ns, time_ns)
-        found = [each for each in nearest if each in equal]
-        for number in [] if found else possible.tolist():
+        found: list[int] = []
+        for number in sorted(possible.tolist(), key=lambda number: abs(before_ns[number])):
             asked_ns = time_ns - int(before_ns[number])
             nearest = nearest_so_far(acquired_ns, series.published_ns, asked_ns)
             if equal[number] in nearest:
-                found, time_ns, held_up = [int(equal[number])], asked_ns, held_up + 1
+                found, time_ns = [int(equal[number])], asked_ns
+                held_up += before_ns[number] > TIE_NS
                 break
         assert found, f"{name}, row {row}: not the frame nearest to its time: {before_ns[possible] / 1e6} ms"
         frame, distance = found[-1], np.abs(acquired_ns - time_ns)

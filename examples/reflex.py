@@ -1,6 +1,6 @@
 """Act on a touch within two samples: python reflex.py [NAMESPACE [JOINTS]].
 
-Prints each event, the time of its sample (CLOCK_MONOTONIC), and its age before and after the action.
+Prints each event, the age of its sample before and after the action, and the sample's time, CLOCK_MONOTONIC.
 
 JOINTS is the service of the hand's joints, in the default namespace, which stops at the request ``hold``: that of a
 simulated hand (``skin-emulate --world mujoco:gripper``), or one that the program of your hand publishes.
@@ -39,8 +39,8 @@ def main() -> None:
             elif event.kind in (EventKind.WITHDRAWN, EventKind.ENDED):
                 begun.discard(event.contact.id)
             acted_us = (now_ns() - event.acquired_ns) / 1000
-            sampled = f"{event.acquired_ns} ns, {age_us:.0f} us {acted_us:.0f} us"
-            print(event.kind.name.lower(), event.contact.id, sampled, flush=True)
+            times = f"{age_us:.0f} us {acted_us:.0f} us {event.acquired_ns} ns"
+            print(event.kind.name.lower(), event.contact.id, times, flush=True)
 
 
 if __name__ == "__main__":

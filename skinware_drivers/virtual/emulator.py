@@ -212,8 +212,8 @@ class Emulator(Stage[OptionsT]):
         return listed
 
     def _in_range(self, felt: Sequence[int] | npt.NDArray[np.int64]) -> list[int]:
-        limits = (self._each(name, len(felt)) for name in ("lowest", "full_scale"))
-        values: list[int] = np.minimum(np.maximum(felt, next(limits)), next(limits)).tolist()
+        lowest, highest = (self._each(name, len(felt)) for name in ("lowest", "full_scale"))
+        values: list[int] = np.minimum(np.maximum(felt, lowest), highest).tolist()
         return values
 
     def _each(self, name: str, n_values: int | None = None) -> npt.NDArray[np.int64]:

@@ -102,7 +102,7 @@ def run(started: list[tuple[str, ...]], closings: int, seed: int, folder: Path) 
             if not begun:
                 missed += 1
                 continue
-            _, frame_ns, sent_us, done_us = map(int, begun[0])
+            _, sent_us, done_us, frame_ns = map(int, begun[0])
             frame_ms = (frame_ns - contact_ns) / 1e6
             stages_ms = frame_ms, sent_us / 1e3, (done_us - sent_us) / 1e3, frame_ms + done_us / 1e3
             for of_stage, stage_ms in zip(late.values(), stages_ms, strict=True):

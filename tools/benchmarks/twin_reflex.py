@@ -32,7 +32,7 @@ from skinware.service import ServiceReader
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "skinware_drivers" / "virtual" / "physics" / "scenes" / "gripper.xml"
 PRIORITY = 40
-"""Of the driver; the emulator has one less, what reads the driver one more each."""
+"""Priority of the driver; that of the emulator is one less, that of each program behind the driver one more."""
 SETTLED_S = 8.0
 LIMIT_MS = 12
 BINDING = """

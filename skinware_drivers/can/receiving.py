@@ -1,6 +1,6 @@
-"""Receive all datagrams of a CAN socket with one system call (``recvmmsg``), dated on CLOCK_MONOTONIC (decision 7).
+"""What goes with the frames of a CAN socket: the memory that C receives them into, their stamps, and the controller.
 
-Their controller's rates and state come by rtnetlink; its error frames and the load on its wire from the frames.
+The controller's rates and state come by rtnetlink, and between two answers by its error frames.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import BusReason
-from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
+from skinware_drivers import native
+from skinware_drivers.bus import FrameBatch
+from skinware_drivers.native import structs
+from skinware_drivers.native.compiling import compile_batch
 from skinware_drivers.native.device_time import DeviceClock, Times
 
 NO_CAN = "this kernel has no CAN: load it (sudo modprobe can-raw), or use a bus that needs none (--bus virtual)"
@@ -190,37 +193,6 @@ class ControllerHealth:
         return next((t for t, until_ns in self._trouble_until_ns.items() if time_ns < until_ns), BusReason.NONE)
 
 
-# ISO 11898-1: bits of a frame without its payload and stuff bits, with the pause behind it
-_CLASSIC_PAYLOAD = 8
-_CLASSIC_BITS, _CLASSIC_EXTENDED_BITS = 47, 67
-_FD_BITS, _FD_EXTENDED_BITS = 30, 49  # at the nominal rate: before the bit rate switch, and from the acknowledgement on
-_FD_SHORT_DATA_BITS, _FD_LONG_DATA_BITS = 32, 37  # at the data rate, with fixed stuff bits: check sum of 17 or 21
-_LONGEST_SHORT_FD = 16
-_STUFFING = 1.1
-# flags of linux/can.h; kernels before 5.14 do not set the last one
-_SWITCHED, _PASSIVE_SENDER, _IS_FD = 0x01, 0x02, 0x04
-
-
-def wire_bits(wire: npt.NDArray[np.void], speed_up: float = 1.0) -> float:
-    """Return about how many bits of the nominal rate frames take; CAN FD frames may switch to a faster one."""
-    if wire.dtype["payload"].shape[0] == _CLASSIC_PAYLOAD:
-        return _classic_bits(wire)
-    length, flags = wire["length"].astype(np.int64), wire["flags"]
-    is_fd = (flags & np.uint8(_SWITCHED | _PASSIVE_SENDER | _IS_FD) != 0) | (length > _CLASSIC_PAYLOAD)
-    fd, length = wire[is_fd], length[is_fd]
-    extended = int(np.count_nonzero(fd["identifier"] & np.uint32(EXTENDED_FLAG)))
-    bits = _FD_BITS * (len(fd) - extended) + _FD_EXTENDED_BITS * extended
-    data = np.where(length > _LONGEST_SHORT_FD, _FD_LONG_DATA_BITS, _FD_SHORT_DATA_BITS) + 8 * length
-    share = np.where(fd["flags"] & np.uint8(_SWITCHED), 1 / speed_up, 1.0)
-    return _classic_bits(wire[~is_fd]) + _STUFFING * (bits + float(data @ share))
-
-
-def _classic_bits(wire: npt.NDArray[np.void]) -> float:
-    extended = int(np.count_nonzero(wire["identifier"] & np.uint32(EXTENDED_FLAG)))
-    bits = _CLASSIC_BITS * (len(wire) - extended) + _CLASSIC_EXTENDED_BITS * extended
-    return _STUFFING * (bits + 8 * int(wire["length"].sum(dtype=np.int64)))
-
-
 LONGEST_DELAY_NS = 100_000_000
 """No frame had its stamp longer before the kernel had the frame."""
 _PART_NS, _JUMP_NS = 250_000_000, 10_000_000  # of the clock of a controller
@@ -230,11 +202,7 @@ _SO_TIMESTAMPNS, _SO_TIMESTAMPING = 35, 37
 _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1 << 6
 _SIOCETHTOOL, _ETHTOOL_GET_TS_INFO = 0x8946, 0x41
 _TS_INFO_BYTES = 44
-_SOFTWARE_WORD, _HARDWARE_WORD = 2, 6  # words of the ancillary data: seconds, then nanoseconds
-
-_CLOCK_READS = 3
-_SLEW_NS = 2_000_000
-"""A larger change of CLOCK_REALTIME between two polls is a step: it is disciplined by far less."""
+_HARDWARE_WORD = 6  # of the ancillary data: seconds, then nanoseconds
 
 
 def has_hardware_stamps(sock: socket.socket, interface: str) -> bool:
@@ -251,9 +219,9 @@ def has_hardware_stamps(sock: socket.socket, interface: str) -> bool:
 
 
 class Stamper:
-    """Reads the stamps of one socket.
+    """The clocks of the stamps of one socket (decision 7).
 
-    Software stamps are CLOCK_REALTIME. They are converted with an offset that is sampled at every poll, so that steps
+    Software stamps are CLOCK_REALTIME. C converts them with an offset that is sampled at every poll, so that steps
     of that clock do no harm: a frame lies between two polls, and only one of the offsets before and after a step puts
     it there. Hardware stamps are on the controller's clock, which may be set or restarted at any time.
 
@@ -267,7 +235,7 @@ class Stamper:
         self.hardware = hardware
         self._clock = DeviceClock(1e-9, 1 << 62, part_ns=_PART_NS, jump_ns=_JUMP_NS)
         self.last_poll_ns = now_ns()
-        self.offset_ns = _offset_now_ns()[0]
+        self.offset_ns = self.last_poll_ns - time.time_ns()
 
     def switch_on(self, sock: socket.socket) -> None:
         if self.hardware:
@@ -276,33 +244,6 @@ class Stamper:
         else:
             # 20 ns a frame cheaper, and stamps also frames from before the kernel began to stamp (in the background)
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-
-    def read(self, control: Times) -> Times:
-        """Return (n,) int64, CLOCK_MONOTONIC ns: when the frames of (n, 8) int64 ancillary data arrived, in order."""
-        before_ns = self.offset_ns
-        self.offset_ns, poll_ns = _offset_now_ns()
-        software = control[:, _SOFTWARE_WORD] * NS_PER_S + control[:, _SOFTWARE_WORD + 1]
-        stamps: Times = software + self.offset_ns
-        is_step = abs(self.offset_ns - before_ns) > _SLEW_NS
-        if is_step:
-            other = software + before_ns
-            is_other = (other >= self.last_poll_ns) & (other <= poll_ns)
-            is_other &= (stamps < self.last_poll_ns) | (stamps > poll_ns)
-            stamps[is_other] = other[is_other]
-        if self.hardware:
-            stamps[software == 0] = poll_ns
-        np.maximum(stamps, self.last_poll_ns, out=stamps)
-        np.minimum(stamps, poll_ns, out=stamps)
-        if is_step:
-            np.maximum.accumulate(stamps, out=stamps)
-        else:
-            # the kernel begins to stamp in the background: earlier frames have the time at which they were read
-            stamps = np.minimum.accumulate(stamps[::-1])[::-1]
-        # one batch may be taken in several calls, so frames of this call can be older than its predecessor's end
-        self.last_poll_ns = min(int(stamps[-1]), poll_ns)
-        if self.hardware:
-            return self.by_controller(control[:, _HARDWARE_WORD] * NS_PER_S + control[:, _HARDWARE_WORD + 1], stamps)
-        return stamps
 
     def by_controller(self, hardware: Times, software: Times) -> Times:
         """Return (n,) int64, CLOCK_MONOTONIC ns: when frames were on the wire.
@@ -315,19 +256,6 @@ class Stamper:
         earliest_ns = software[known] - LONGEST_DELAY_NS
         stamps[known] = np.maximum(self._clock.convert(hardware[known], software[known]), earliest_ns)
         return stamps
-
-
-def _offset_now_ns() -> tuple[int, int]:
-    """Return (CLOCK_MONOTONIC - CLOCK_REALTIME, CLOCK_MONOTONIC), ns; a pause between the two readings does no harm."""
-    best_ns, offset_ns, poll_ns = NS_PER_S, 0, 0
-    for _ in range(_CLOCK_READS):
-        first_ns, real_ns, second_ns = now_ns(), time.time_ns(), now_ns()
-        if second_ns - first_ns < best_ns or not poll_ns:
-            best_ns, offset_ns = second_ns - first_ns, (first_ns + second_ns) // 2 - real_ns
-        poll_ns = second_ns
-        if best_ns < 2000:
-            break
-    return offset_ns, poll_ns
 
 
 CONTROL_WORDS = 8
@@ -347,15 +275,17 @@ _MMSGHDR = np.dtype(
 """``struct mmsghdr`` of a 64-bit Linux; int members are read and written with their padding."""
 _IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
 
-_recvmmsg = ctypes.CDLL(None, use_errno=True).recvmmsg
-_recvmmsg.argtypes = [ctypes.c_int, ctypes.c_void_p, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p]
-_recvmmsg.restype = ctypes.c_int
+_receive = native.library().quick.skinware_receive
+_receive.argtypes, _receive.restype = (ctypes.c_void_p,) * 2, ctypes.c_int64
+_wire_bits = native.library().quick.skinware_wire_bits
+_wire_bits.argtypes = (ctypes.c_void_p, ctypes.c_double, ctypes.c_int64, ctypes.c_int64)
+_wire_bits.restype = ctypes.c_double
 _CLASSIC_ROW_BYTES, _FD_FRAME_BYTES = 16, 72
 """``struct can_frame`` and ``struct canfd_frame``; the kernel always hands out the whole of the latter."""
 
 
 class MessageRows:
-    """The arguments of ``recvmmsg`` for the rows of one batch; see ``rows_of``.
+    """The memory of one batch, and the arguments of ``recvmmsg`` for its rows; see ``rows_of``.
 
     The end of a CAN FD frame that is longer than a row goes into a scratch buffer.
 
@@ -380,16 +310,26 @@ class MessageRows:
         self._headers["iov"] = self._iov.ctypes.data + self._iov.strides[0] * rows
         self._headers["iov_count"] = 2 if beyond > 0 else 1
         self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
-        self._control_length = self._headers["control_length"]
         self._flags, self._length = self._headers["flags"], self._headers["length"]
         self.headers_address: int = self._headers.ctypes.data
+        self._arrays = structs.Arrays()
+        self.memory = compile_batch(batch, self._arrays)
 
-    def receive(self, fd: int, free: slice) -> int:
-        """Fill free rows of the batch; return how many were filled, -1 on an error (errno)."""
-        self._control_length[free] = 8 * CONTROL_WORDS  # the kernel wrote what it used
-        address = self.headers_address + _MMSGHDR.itemsize * free.start
-        count: int = _recvmmsg(fd, address, free.stop - free.start, socket.MSG_DONTWAIT, None)
+    def receive(self, batch: FrameBatch, source: structs.Source) -> int:
+        """Fill free rows of the batch from a source; return how many were filled, below 0: errno."""
+        self.memory.stop, self.memory.limit = batch.stop, batch.limit
+        count: int = _receive(ctypes.byref(self.memory), ctypes.byref(source))
         return count
+
+    def hardware_ns(self, rows: slice) -> Times:
+        """Return (n,) int64, stamps of the controller, ns; 0: none."""
+        stamps: Times = self.control[rows, _HARDWARE_WORD] * NS_PER_S + self.control[rows, _HARDWARE_WORD + 1]
+        return stamps
+
+    def wire_bits(self, first: int, count: int, speed_up: float = 1.0) -> float:
+        """Return about how many bits of the nominal rate frames take; CAN FD frames may switch to a faster one."""
+        bits: float = _wire_bits(ctypes.byref(self.memory), speed_up, first, count)
+        return bits
 
     def forget(self, rows: slice) -> None:
         """Clear ancillary data before frames are received that may have none of their own."""

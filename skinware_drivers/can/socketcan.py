@@ -1,13 +1,11 @@
-"""SocketCAN in batches: one ``recvmmsg`` moves all frames that have arrived into the rows of a batch.
+"""SocketCAN in batches: C moves all frames that have arrived into the rows of a batch (``receiving.c``).
 
 Every frame carries the kernel's own time stamp, and the kernel counts the frames that it drops.
 """
 
 from __future__ import annotations
 
-import array
 import contextlib
-import ctypes
 import errno
 import fcntl
 import os
@@ -28,13 +26,14 @@ from skinware_drivers.can.receiving import (
     CONTROLLER_STATES,
     NO_CAN,
     ControllerHealth,
+    MessageRows,
     Stamper,
     has_hardware_stamps,
     is_missing,
     read_controller,
     rows_of,
-    wire_bits,
 )
+from skinware_drivers.native import structs
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings
 
@@ -47,8 +46,6 @@ _CANFD_BRS = 0x01
 _FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
-_SO_MEMINFO = 55
-_MEMINFO_USED, _MEMINFO_SIZE, _MEMINFO_DROPS = 0, 1, 8
 _SIOCGIFFLAGS = 0x8913
 _IFF_UP = 1
 MOST_FILTERS = 512
@@ -212,28 +209,23 @@ class SocketCanBus(KernelBus):
             raise BusNotAvailable(f"bus {self.channel} is not open")
         if not batch.free:
             return 0
-        rows, first = rows_of(batch), batch.stop
-        free = slice(first, batch.limit)
+        rows, first, source = rows_of(batch), batch.stop, structs.Source(bus=ordinal)
+        self._lend(self._socket, rows, source)
         if self._stamper.hardware:
-            rows.forget(free)
-        count = rows.receive(self._socket.fileno(), free)
+            rows.forget(slice(first, batch.limit))
+        count = rows.receive(batch, source)
         if count < 0:
-            return self.nothing_received(ctypes.get_errno())
+            return self.nothing_received(-count)
         new = slice(first, first + count)
-        batch.time_ns[new] = self._stamper.read(rows.control[new])
-        batch.bus[new] = ordinal
+        if self._stamper.hardware:
+            batch.time_ns[new] = self._stamper.by_controller(rows.hardware_ns(new), batch.time_ns[new])
         if self.tap.is_open:
             self.tap.keep_rows(batch.wire[new], batch.time_ns[new], rows.are_fd(new))
-        kept = self.sort_out(batch, new)
+        source.frames = kept = self.sort_out(batch, new)
         batch.stop += kept
-        self.counters.frames += kept
         if self.bit_rate:
-            self.wire_bits += wire_bits(batch.wire[first : first + kept], self._speed_up)
-        # how full the receive buffer is, and how many frames did not fit
-        data = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
-        words = array.array("I", data)
-        self.counters.dropped = self._dropped_before + words[_MEMINFO_DROPS]
-        self.fullest: float = max(self.fullest, words[_MEMINFO_USED] / words[_MEMINFO_SIZE])
+            source.wire_bits = rows.wire_bits(first, kept, self._speed_up)
+        self._count(source)
         return kept
 
     @property
@@ -244,23 +236,28 @@ class SocketCanBus(KernelBus):
     def hand_over(self, batch: FrameBatch, source: Source) -> bool:
         if self._socket is None or not self.reads_natively:
             return False
-        rows = rows_of(batch)
-        source.fd, source.stream, source.tap = self._socket.fileno(), None, self.tap.address
-        source.headers, source.control = rows.headers_address, rows.control.ctypes.data
-        source.offset_ns, source.last_poll_ns = self._stamper.offset_ns, self._stamper.last_poll_ns
-        source.dropped_before, source.dropped, source.frames = self._dropped_before, self.counters.dropped, 0
+        self._lend(self._socket, rows_of(batch), source)
+        source.stream, source.tap, source.frames = None, self.tap.address, 0
         source.is_counted, source.speed_up, source.wire_bits = self.bit_rate > 0, self._speed_up, 0.0
         source.is_small, source.fullest = self.granted_buffer < _SMALL_BUFFER, 0.0
         return True
 
     def take_back(self, source: Source) -> None:
+        self._count(source)
+        if source.frames:
+            self._health.heard_data()
+
+    def _lend(self, sock: socket.socket, rows: MessageRows, source: Source) -> None:
+        source.fd, source.headers, source.control = sock.fileno(), rows.headers_address, rows.control.ctypes.data
+        source.offset_ns, source.last_poll_ns = self._stamper.offset_ns, self._stamper.last_poll_ns
+        source.dropped_before, source.dropped = self._dropped_before, self.counters.dropped
+
+    def _count(self, source: Source) -> None:
         self._stamper.offset_ns, self._stamper.last_poll_ns = source.offset_ns, source.last_poll_ns
         self.counters.frames += source.frames
         self.counters.dropped = source.dropped
         self.wire_bits += source.wire_bits
-        self.fullest = max(self.fullest, source.fullest)
-        if source.frames:
-            self._health.heard_data()
+        self.fullest: float = max(self.fullest, source.fullest)
 
     def send(self, identifier: int, payload: bytes) -> None:
         sock = self.may_send_by(self._socket)

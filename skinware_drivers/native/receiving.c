@@ -27,17 +27,18 @@ static int64_t offset_now_ns(int64_t *poll_ns)
     return offset_ns;
 }
 
-static void stamp(struct path *path, struct source *source, int64_t first, int64_t n)
+/* Give rows the times of their stamps; they were taken at `poll_ns`, with this offset of the clocks. */
+SKINWARE_EXPORT void skinware_stamp(struct batch *batch, struct source *source, int64_t first, int64_t n,
+                                    int64_t offset_ns, int64_t poll_ns)
 {
     const int64_t *control = (const int64_t *)(intptr_t)source->control;
-    int64_t before_ns = source->offset_ns, poll_ns = 0, *stamps = path->batch->time_ns + first, latest_ns = INT64_MIN;
-    source->offset_ns = offset_now_ns(&poll_ns);
-    int64_t step_ns = source->offset_ns - before_ns;
+    int64_t before_ns = source->offset_ns, *stamps = batch->time_ns + first, latest_ns = INT64_MIN;
+    int64_t step_ns = offset_ns - before_ns;
     bool is_step = step_ns > SLEW_NS || step_ns < -SLEW_NS, is_falling = false;
     for (int64_t i = 0; i < n; i++) {
         const int64_t *words = control + (first + i) * (CONTROL_BYTES / 8) + SOFTWARE_WORD;
         int64_t software_ns = words[0] * INT64_C(1000000000) + words[1], other_ns = software_ns + before_ns;
-        stamps[i] = software_ns + source->offset_ns;
+        stamps[i] = software_ns ? software_ns + offset_ns : poll_ns;
         if (is_step && other_ns >= source->last_poll_ns && other_ns <= poll_ns &&
             (stamps[i] < source->last_poll_ns || stamps[i] > poll_ns))
             stamps[i] = other_ns;
@@ -53,6 +54,7 @@ static void stamp(struct path *path, struct source *source, int64_t first, int64
     for (int64_t i = n - 2; is_falling && i >= 0; i--)
         if (stamps[i] > stamps[i + 1])
             stamps[i] = stamps[i + 1];
+    source->offset_ns = offset_ns;
     source->last_poll_ns = latest_ns < poll_ns ? latest_ns : poll_ns;
 }
 
@@ -71,9 +73,9 @@ static bool is_usual(const struct path *path, const struct source *source, int64
     return !(identifiers & UNUSUAL) && !(flags & MSG_TRUNC) && longest <= path->batch->payload_size;
 }
 
-static double wire_bits(const struct path *path, const struct source *source, int64_t first, int64_t n)
+/* About how many bits of the nominal rate frames take; CAN FD frames may switch to one that is faster by `speed_up`. */
+SKINWARE_EXPORT double skinware_wire_bits(const struct batch *batch, double speed_up, int64_t first, int64_t n)
 {
-    const struct batch *batch = path->batch;
     double bits = 0;
     for (int64_t row = first; row < first + n; row++) {
         int64_t length = length_of(batch, row), flags = batch->wire[row * batch->row_bytes + 5];
@@ -82,39 +84,54 @@ static double wire_bits(const struct path *path, const struct source *source, in
                      (flags & (SWITCHED | PASSIVE_SENDER | IS_FD) || length > CLASSIC_PAYLOAD);
         if (is_fd)
             bits += (is_extended ? 49 : 30) + (double)((length > LONGEST_SHORT_FD ? 37 : 32) + 8 * length) *
-                                                  (flags & SWITCHED ? 1 / source->speed_up : 1.0);
+                                                  (flags & SWITCHED ? 1 / speed_up : 1.0);
         else
             bits += (double)((is_extended ? 67 : 47) + 8 * length);
     }
     return 1.1 * bits;
 }
 
-static void read_memory(struct path *path, struct source *source)
+/* How full the receive buffer is, and how many frames did not fit; whether more did not. */
+static bool read_memory(struct source *source)
 {
     uint32_t words[MEMORY_WORDS];
     socklen_t size = sizeof words;
     if (getsockopt((int)source->fd, SOL_SOCKET, MEMORY_INFO, words, &size) || size < sizeof words)
-        return;
+        return false;
     double full = (double)words[MEMORY_USED] / words[MEMORY_SIZE];
     int64_t dropped = source->dropped_before + words[MEMORY_DROPS];
     if (full > source->fullest)
         source->fullest = full;
-    if (dropped == source->dropped)
-        return;
+    bool is_more = dropped != source->dropped;
     source->dropped = dropped;
-    path->plan->counts[source->bus * path->plan->n_counts + path->plan->dropped_column] = dropped;
-    path->plan->interrupted[source->bus] = 1;
+    return is_more;
 }
 
-/* One call of the kernel: how many datagrams it gave, into rows from the batch's stop on. */
-static int64_t receive_some(struct path *path, const struct source *source)
+/* One call of the kernel: how many datagrams it gave, with their times, into rows from the batch's stop on; or -1. */
+static int64_t receive_some(struct batch *batch, struct source *source, int64_t most)
 {
-    struct batch *batch = path->batch;
     struct mmsghdr *headers = (struct mmsghdr *)(intptr_t)source->headers + batch->stop;
-    int64_t n = batch->limit - batch->stop < ROWS_AT_ONCE ? batch->limit - batch->stop : ROWS_AT_ONCE;
+    int64_t n = batch->limit - batch->stop < most ? batch->limit - batch->stop : most, poll_ns = 0, offset_ns;
     for (int64_t i = 0; i < n; i++)
         headers[i].msg_hdr.msg_controllen = CONTROL_BYTES;
-    return recvmmsg((int)source->fd, headers, (unsigned)n, MSG_DONTWAIT, NULL);
+    n = recvmmsg((int)source->fd, headers, (unsigned)n, MSG_DONTWAIT, NULL);
+    if (n <= 0)
+        return n;
+    offset_ns = offset_now_ns(&poll_ns);
+    skinware_stamp(batch, source, batch->stop, n, offset_ns, poll_ns);
+    for (int64_t row = batch->stop; row < batch->stop + n; row++)
+        batch->bus[row] = (uint16_t)source->bus;
+    return n;
+}
+
+/* The same for Python, which sorts the rows itself; below 0: errno. */
+SKINWARE_EXPORT int64_t skinware_receive(struct batch *batch, struct source *source)
+{
+    int64_t n = receive_some(batch, source, batch->limit - batch->stop);
+    if (n < 0)
+        return -errno;
+    read_memory(source);
+    return n;
 }
 
 /* Append what has arrived to the batch, up to its limit; whether there are rows. */
@@ -124,7 +141,7 @@ bool receive(struct path *path, struct source *source)
     int64_t begin = batch->stop, n = ROWS_AT_ONCE;
     while (n == ROWS_AT_ONCE && batch->stop < batch->limit) {
         int64_t first = batch->stop, kept;
-        n = receive_some(path, source);
+        n = receive_some(batch, source, ROWS_AT_ONCE);
         if (n < 0 && errno != EAGAIN && errno != EINTR) {
             path->plan->hooks.lose(source->bus, errno);
             source->fd = -1;
@@ -132,20 +149,20 @@ bool receive(struct path *path, struct source *source)
         }
         if (n <= 0)
             break;
-        stamp(path, source, first, n);
         if (source->tap)
             keep_frames(path, source, first, n);
-        for (int64_t row = first; row < first + n; row++)
-            batch->bus[row] = (uint16_t)source->bus;
         kept = is_usual(path, source, first, n) ? n : path->plan->hooks.sort_out(source->bus, first, n);
         batch->stop += kept;
         source->frames += kept;
         path->plan->counts[source->bus * path->plan->n_counts + path->plan->frames_column] += kept;
         if (source->is_counted)
-            source->wire_bits += wire_bits(path, source, first, kept);
+            source->wire_bits += skinware_wire_bits(batch, source->speed_up, first, kept);
     }
     /* frames are lost only where many wait, or the buffer is full after a few */
-    if (batch->stop - begin >= ROWS_AT_ONCE || batch->stop == batch->limit || source->is_small)
-        read_memory(path, source);
+    bool may_lose = batch->stop - begin >= ROWS_AT_ONCE || batch->stop == batch->limit || source->is_small;
+    if (may_lose && read_memory(source)) {
+        path->plan->counts[source->bus * path->plan->n_counts + path->plan->dropped_column] = source->dropped;
+        path->plan->interrupted[source->bus] = 1;
+    }
     return batch->stop > begin;
 }

@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from skinware import DriverReader
 from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, load_report
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, FrameBatch
-from skinware_drivers.can.receiving import wire_bits
+from skinware_drivers.can.receiving import rows_of
 from skinware_drivers.running.news import HIGH_FILL, HIGH_LOAD, BusLimits, MachineLimits
 from tests.sdk.clock import Clock
 from tests.sdk.driving import driving, emulated, read_until
@@ -94,18 +93,19 @@ def test_bits_on_the_wire_lie_between_no_and_all_stuff_bits() -> None:
     batch.append(0, 0, 0x123, b"")
     batch.append(0, 0, 0x123, bytes(8))
     batch.append(0, 0, EXTENDED_FLAG | 0x123, bytes(8))
-    bits = [wire_bits(batch.wire[row : row + 1]) for row in range(3)]
+    bits = [rows_of(batch).wire_bits(row, 1) for row in range(3)]
     for told, least, most in zip(bits, (47, 111, 131), (55, 135, 160), strict=True):
         assert least <= told <= most
-    assert wire_bits(batch.wire[:3]) == pytest.approx(sum(bits))
-    assert wire_bits(batch.wire[:0]) == 0
-    many = np.repeat(batch.wire[1:2], 8_000)
-    assert 0.8 < wire_bits(many) / 1_000_000 < 1.0  # 8000 frames/s are a full bus of 1 Mbit/s
+    assert rows_of(batch).wire_bits(0, 3) == pytest.approx(sum(bits))
+    assert rows_of(batch).wire_bits(0, 0) == 0
+    many = FrameBatch(8_000)
+    many.wire[:] = batch.wire[1]
+    assert 0.8 < rows_of(many).wire_bits(0, 8_000) / 1_000_000 < 1.0  # 8000 frames/s are a full bus of 1 Mbit/s
     wide = FrameBatch(3, 64)
     wide.append(0, 0, 0x123, b"")
     wide.append(0, 0, 0x123, bytes(8))
     wide.append(0, 0, EXTENDED_FLAG | 0x123, bytes(8))
-    assert wire_bits(wide.wire, 8.0) == pytest.approx(sum(bits))  # classic frames among FD frames
+    assert rows_of(wide).wire_bits(0, 3, 8.0) == pytest.approx(sum(bits))  # classic frames among FD frames
 
 
 SWITCHED, IS_FD = 0x01, 0x04
@@ -128,7 +128,7 @@ def test_fd_frames_take_the_time_of_both_bit_rates(
     batch = FrameBatch(1, 64)
     batch.append(0, 0, identifier, bytes(length))
     batch.wire["flags"][0] = flags
-    assert least <= wire_bits(batch.wire[:1], 8.0) <= most
+    assert least <= rows_of(batch).wire_bits(0, 1, 8.0) <= most
 
 
 def stat(*dropped: int) -> str:

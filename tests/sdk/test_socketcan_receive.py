@@ -5,7 +5,6 @@ The kernel stamps, buffers and drops them as it does with CAN frames. On real CA
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import socket
 import struct
@@ -260,7 +259,7 @@ def test_an_interface_that_fails_says_how(
 ) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(receiving, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(receiving, "_receive", lambda *_: -number)
     with pytest.raises(BusNotAvailable, match=words) as caught:
         bus.receive(FrameBatch(10), 0)
     assert caught.value.is_down is is_down
@@ -270,7 +269,7 @@ def test_an_interface_that_fails_says_how(
 def test_nothing_to_receive_is_no_failure(cable: Cable, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     bus = SocketCanBus("can0")
     bus.adopt(cable.end)
-    monkeypatch.setattr(receiving, "_recvmmsg", lambda *_: -1 if ctypes.set_errno(number) >= 0 else 0)
+    monkeypatch.setattr(receiving, "_receive", lambda *_: -number)
     assert bus.receive(FrameBatch(10), 0) == 0
 
 

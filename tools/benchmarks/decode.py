@@ -147,12 +147,13 @@ class Kernel:
         self.bus = SocketCanBus("bench")
         self.bus.adopt(sock)
         self.batch = FrameBatch(2048)
-        self.rows, self.fd = rows_of(self.batch), sock.fileno()
+        self.rows, self.source = rows_of(self.batch), structs.Source()
+        self.bus.hand_over(self.batch, self.source)
 
     def drain(self) -> int:
         """Receive everything that waits; returns the number of frames."""
         total = 0
-        while (count := self.rows.receive(self.fd, slice(0, 2048))) > 0:
+        while (count := self.rows.receive(self.batch, self.source)) > 0:
             total += count
         return total
 

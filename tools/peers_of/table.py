@@ -18,6 +18,7 @@ NOT_HAD = (2, 77)
 """Exit statuses of tools whose program cannot be had on this machine."""
 SCRIPTS = {
     "anyskin": ("magnetic.py", "anyskin", "anyskin"),
+    "flexitac": ("flexitac_pad.py", "flexitac"),
     "linkerbot": ("linkerhand.py", "linkerbot"),
     "linkerbot-py": ("linkerhand.py", "linkerbot-py"),
     "reskin_sensor": ("magnetic.py", "reskin_sensor", "reskin_sensor"),

@@ -21,8 +21,8 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S
-from skinware.samples import SAMPLE, SAMPLES
 from skinware.service import Schema, ServiceReader, Writer
+from skinware.status import SAMPLE, SAMPLES
 from skinware.structure import Structure
 
 KIND = "driver"

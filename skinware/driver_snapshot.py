@@ -10,8 +10,7 @@ import numpy.typing as npt
 from skinware.memory.ring import Sample
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import SAMPLE, SAMPLES
-from skinware.status import DataPath, is_fresh
+from skinware.status import SAMPLE, SAMPLES, DataPath, is_fresh
 from skinware.structure import Structure
 
 
@@ -92,7 +91,7 @@ class DriverSnapshot(Sample):
 
     @property
     def bus_samples(self) -> npt.NDArray[np.void]:
-        """(n_buses, SAMPLES) of :data:`skinware.samples.SAMPLE`: frames that were not used, the newest few of a kind.
+        """(n_buses, SAMPLES) of :data:`skinware.status.SAMPLE`: frames that were not used, the newest few of a kind.
 
         Places are empty where there are none.
         """

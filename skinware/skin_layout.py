@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from skinware import _names
+from skinware import text
 from skinware._columns import Index, texts
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
@@ -64,12 +64,12 @@ class SkinLayout:
         """Names of the patches of all drivers, driver by driver; of those that share one ``board 8 of torso``."""
         pairs = zip(self.drivers, self.structures, strict=True)
         named = [(name, driver) for driver, structure in pairs for name in structure.patch_names]
-        return _names.distinct([name for name, _ in named], [driver for _, driver in named], "of")
+        return text.distinct([name for name, _ in named], [driver for _, driver in named], "of")
 
     @cached_property
     def modules(self) -> tuple[str, ...]:
         """Names of the modules of all drivers, driver by driver, each after that of its patch."""
-        return _names.module_names(
+        return text.module_names(
             [name for structure in self.structures for name in texts(structure.module_name)],
             [kind for structure in self.structures for kind in texts(structure.module_kind)],
             self._in_whole("module_patch", "n_patches").tolist(),
@@ -136,7 +136,7 @@ class SkinLayout:
         first = sum(structure.n_sensors for structure in self.structures[:driver])
         row = int(self._rows(type_name)[position]) - first
         module = self.modules[self.module_of(type_name)[position]]
-        return _names.joined(module, self.structures[driver].name_in_module(row))
+        return text.joined(module, self.structures[driver].name_in_module(row))
 
     def matrices(self, type_name: str) -> Matrices[ModuleKey]:
         """Return where the sensors of a type are in modules that are matrices: indices for arrays in the same order.
@@ -156,7 +156,7 @@ class SkinLayout:
             keys: list[ModuleKey] = []
             for driver, structure in zip(self.drivers, self.structures, strict=True):
                 patches = structure.module_patch.tolist()
-                own = _names.names_in_patches(texts(structure.module_name), texts(structure.module_kind), patches)
+                own = text.names_in_patches(texts(structure.module_name), texts(structure.module_kind), patches)
                 keys += [(driver, structure.patch_names[of], name) for of, name in zip(patches, own, strict=True)]
             kinds = [kind for structure in self.structures for kind in texts(structure.module_kind)]
             names = [name for structure in self.structures for name in structure.module_names]

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from skinware import _names
+from skinware import text
 from skinware._columns import Index, as_index, column, frozen, group, same_length, texts, within
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
@@ -251,7 +251,7 @@ class Structure:
     @cached_property
     def patch_names(self) -> tuple[str, ...]:
         """Name of every patch, as people know it: ``board 8``; of those that share one ``board 8 on can0``."""
-        return _names.distinct(texts(self.patch_name), [self.buses[bus] for bus in self.patch_bus.tolist()], "on")
+        return text.distinct(texts(self.patch_name), [self.buses[bus] for bus in self.patch_bus.tolist()], "on")
 
     @cached_property
     def module_names(self) -> tuple[str, ...]:
@@ -260,7 +260,7 @@ class Structure:
         Where the driver gives none, its kind and a number, both as they are in the patch; the only module of a patch
         is called as the patch.
         """
-        return _names.module_names(
+        return text.module_names(
             texts(self.module_name), texts(self.module_kind), self.module_patch.tolist(), self.patch_names
         )
 
@@ -274,7 +274,7 @@ class Structure:
         Args:
             position: in a sample.
         """
-        return _names.joined(self.module_names[self.sensor_module[position]], self.name_in_module(position))
+        return text.joined(self.module_names[self.sensor_module[position]], self.name_in_module(position))
 
     def sensor_names(self, type_name: str) -> list[str]:
         """``sensor_name`` of all sensors of a type, in the order of ``index(type_name)``.
@@ -288,7 +288,7 @@ class Structure:
         numbers = (self.sensor_uid[of_type] - lowest[module]).tolist()
         is_only = (np.bincount(module, minlength=self.n_modules) == 1)[module].tolist()
         return [
-            _names.joined(self.module_names[of], _names.name_in_module(type_name, number, is_only=only))
+            text.joined(self.module_names[of], text.name_in_module(type_name, number, is_only=only))
             for of, number, only in zip(module.tolist(), numbers, is_only, strict=True)
         ]
 
@@ -296,7 +296,7 @@ class Structure:
         """Return what ``sensor_name`` adds to the name of the module: ``taxel 5``; empty where it adds nothing."""
         of_module = self.module_index(int(self.sensor_module[position]))
         type_id = int(self.sensor_type[position])
-        return _names.name_in_module(
+        return text.name_in_module(
             next(t.name for t in self.types if t.id == type_id),
             int(self.sensor_uid[position] - self.sensor_uid[of_module].min()),
             is_only=int((self.sensor_type[of_module] == type_id).sum()) == 1,

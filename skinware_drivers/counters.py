@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import SAMPLE, SAMPLES_OF_A_KIND, Unused
+from skinware.status import SAMPLE, SAMPLES_OF_A_KIND, Unused
 
 
 @dataclass

@@ -19,10 +19,9 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.memory.statistics import Histogram, WriterStatistics
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import sample_report
 from skinware.service import ServiceReader
 from skinware.state import DriverReport, life_of, rate_now_hz, report_of
-from skinware.status import DataPath, load_report
+from skinware.status import DataPath, load_report, sample_report
 from skinware.structure import Structure
 from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import NAME as HEALTH_KIND

@@ -122,7 +122,7 @@ def _table(titles: Sequence[str], rows: Sequence[Sequence[str]], left: int) -> l
 
 
 def _driver_lines(driver: dict[str, Any]) -> list[str]:
-    from skinware.samples import sample_text
+    from skinware.status import sample_text
 
     counts = [plural(driver["patches"], "patch", "patches"), plural(driver["modules"], "module")]
     size = ", ".join([*counts, plural(driver["sensors"], "sensor")])

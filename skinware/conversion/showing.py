@@ -14,7 +14,6 @@ import numpy.typing as npt
 from mcap.records import Schema
 
 from skinware._columns import Index
-from skinware._names import distinct
 from skinware.conversion import ros_messages
 from skinware.conversion.ros_messages import Cdr, acquired_ns
 from skinware.driver_snapshot import DriverSnapshot
@@ -25,6 +24,7 @@ from skinware.sensor_types import SensorType
 from skinware.state import state_name
 from skinware.status import BusState, PatchState
 from skinware.structure import Structure
+from skinware.text import distinct
 from skinware.transfer.generation import Generation
 from skinware.views.scene import shape_of
 

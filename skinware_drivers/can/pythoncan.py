@@ -13,8 +13,7 @@ import can
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import Unused
-from skinware.status import BusReason
+from skinware.status import BusReason, Unused
 from skinware.wire import IS_FD
 from skinware_drivers.bus import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Bus, FrameBatch, identifier_text
 from skinware_drivers.counters import BusCounters

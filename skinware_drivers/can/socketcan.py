@@ -19,8 +19,7 @@ import numpy as np
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
-from skinware.samples import Unused
-from skinware.status import BusReason
+from skinware.status import BusReason, Unused
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, KernelBus, identifier_text
 from skinware_drivers.can.receiving import (
     CONTROLLER_STATES,

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.samples import Unused
-from skinware.status import Status
+from skinware.status import Status, Unused
 from skinware_drivers.counters import Samples
 from skinware_drivers.decoding.addresses import STANDARD_IDENTIFIERS
 from skinware_drivers.decoding.compiled import CompiledLayouts

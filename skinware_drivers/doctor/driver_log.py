@@ -14,9 +14,8 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.matrices import filled_by
 from skinware.memory.statistics import BUCKETS, Histogram
-from skinware.samples import sample_report, sample_text
 from skinware.state import count_statuses, state_name
-from skinware.status import BusReason, BusState, PatchState, Status, load_report
+from skinware.status import BusReason, BusState, PatchState, Status, load_report, sample_report, sample_text
 from skinware.structure import Structure
 from skinware.tactile.chain import ChainSettings
 from skinware.tactile.health import HealthKind, HealthReport

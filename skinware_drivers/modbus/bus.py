@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import Unused
+from skinware.status import Unused
 from skinware_drivers.bus import Bus, FrameBatch, KernelBus
 from skinware_drivers.modbus import wire
 from skinware_drivers.modbus.gateway import Gateway, Guests

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 import skinware.native
 from skinware.realtime import now_ns
-from skinware.samples import Unused
-from skinware.status import PatchState, Status
+from skinware.status import PatchState, Status, Unused
 from skinware_drivers import native
 from skinware_drivers.bus import Filter, FrameBatch
 from skinware_drivers.counters import OWN_BUS_COUNTERS

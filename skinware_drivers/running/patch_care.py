@@ -10,8 +10,7 @@ from typing import Any
 
 from skinware.errors import BusError
 from skinware.realtime import NS_PER_S, Periodic, now_ns
-from skinware.samples import Unused, sample_report, sample_text
-from skinware.status import PatchState
+from skinware.status import PatchState, Unused, sample_report, sample_text
 from skinware_drivers.adapter import Adapter
 from skinware_drivers.bus import EXTENDED_FLAG, Bus, identifier_text
 from skinware_drivers.description import Patch
@@ -24,7 +23,7 @@ from skinware_drivers.running.guard import Backoff, hook
 from skinware_drivers.running.news import TROUBLESHOOTING
 
 Sample = Mapping[str, Any]
-"""A sample of :func:`skinware.samples.sample_report`."""
+"""A sample of :func:`skinware.status.sample_report`."""
 
 
 def why_unused(layout: Layout, bus: Bus) -> list[str]:

@@ -15,10 +15,9 @@ from skinware.driver_service import DriverWriter
 from skinware.errors import BusError, ConfigurationError, DriverError
 from skinware.memory.statistics import BUCKETS
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import SAMPLE, SAMPLES
 from skinware.service import Request, RequestServer
 from skinware.service.messages import ACQUIRE
-from skinware.status import LOAD_UNKNOWN, BusState, DataPath, PatchState, age_limit_ns
+from skinware.status import LOAD_UNKNOWN, SAMPLE, SAMPLES, BusState, DataPath, PatchState, age_limit_ns
 from skinware.structure import Structure
 from skinware.text import nearest_name
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own

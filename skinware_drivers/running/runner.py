@@ -11,8 +11,7 @@ from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import Histogram
 from skinware.realtime import now_ns, short_turns
-from skinware.samples import sample_report
-from skinware.status import DataPath, PatchState, load_report
+from skinware.status import DataPath, PatchState, load_report, sample_report
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
 from skinware_drivers.running.building import Builder, Identity, PublishMode

@@ -10,8 +10,7 @@ from typing import ClassVar
 
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware.realtime import NS_PER_S, now_ns
-from skinware.samples import Unused
-from skinware.status import BusReason
+from skinware.status import BusReason, Unused
 from skinware_drivers.bus import FrameBatch, KernelBus
 from skinware_drivers.native.structs import Source
 from skinware_drivers.options import options_from_strings

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.samples import sample_report, sample_text
-from skinware.status import Status
+from skinware.status import Status, sample_report, sample_text
 from skinware.structure import Structure
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch, identifier_text

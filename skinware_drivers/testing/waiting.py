@@ -18,8 +18,7 @@ import pytest
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ServiceTimeout
-from skinware.samples import sample_report, sample_text
-from skinware.status import Status
+from skinware.status import Status, sample_report, sample_text
 from skinware_drivers.virtual.hand_clock import HandClock, HandLoop, NeverEnds, package_on
 
 SLOWER = float(os.environ.get("SKINWARE_TEST_PATIENCE") or (4 if os.environ.get("SKINWARE_CAN_LAB") == "1" else 1))

@@ -12,7 +12,7 @@ import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError
 from skinware.geometry import Geometry
-from skinware.samples import Unused
+from skinware.status import Unused
 from skinware_drivers.bus import Bus, FrameBatch, chosen_by, wire_dtype
 from skinware_drivers.description import Patch
 from skinware_drivers.link import Link

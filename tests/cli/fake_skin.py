@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from skinware import BusState, DriverReader, DriverWriter, Namespace, PatchState, Status, Structure
 from skinware.errors import ServiceError
-from skinware.samples import SAMPLE, SAMPLES
 from skinware.sensor_types import PRESSURE, TEMPERATURE
+from skinware.status import SAMPLE, SAMPLES
 from skinware.tactile.calm_driver import SENSOR_COLUMNS
 from skinware_drivers.testing.waiting import wait_until
 

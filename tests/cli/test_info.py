@@ -19,9 +19,8 @@ from skinware.cli._terminal import shown
 from skinware.cli.info import as_text, command
 from skinware.memory.announcement import MOST_ANNOUNCEMENTS
 from skinware.realtime import now_ns
-from skinware.samples import Unused
 from skinware.service import Columns
-from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, DataPath
+from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, DataPath, Unused
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.commands import BIN, PATIENCE_S
 

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from skinware import DriverReader
-from skinware.samples import Unused, sample_report, sample_text
 from skinware.sensor_types import PRESSURE
+from skinware.status import Unused, sample_report, sample_text
 from skinware_drivers import counters
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
 from skinware_drivers.can import CanAdapter

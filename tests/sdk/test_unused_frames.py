@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from skinware.samples import Unused
 from skinware.sensor_types import PRESSURE
+from skinware.status import Unused
 from skinware_drivers import EXTENDED_FLAG, Frame, Identifier, Layout, Module, NoOptions, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.counters import BusCounters, Samples

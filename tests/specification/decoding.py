@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware.samples import Unused
+from skinware.status import Unused
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.decoding.addresses import FIELD_BITS, STANDARD_IDENTIFIERS, Addresses, Form, KeyField
 from skinware_drivers.decoding.compiled import NO_KIND, Assembly, CompiledCycle

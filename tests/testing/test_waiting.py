@@ -9,7 +9,7 @@ import time
 import pytest
 
 from skinware import DriverReader
-from skinware.samples import Unused
+from skinware.status import Unused
 from skinware_drivers.testing.fault_tests import SilenceTests
 from skinware_drivers.testing.waiting import read_until
 from tests.cli.fake_skin import FakeSkin, fake_structure

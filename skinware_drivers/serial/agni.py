@@ -9,8 +9,8 @@ Wire format: agni_serial_protocol, ``serial_protocol_defines.h`` and ``serial_pr
 * Configuration (id 0): version 01, device u8, count n, n descriptors: type u16, payload length u16. Little-endian in
   the newer program, big-endian in an older one: option ``descriptors``. Sensor k of them (from 1) sends under id k.
 * Data (id 1 to C9): time u32, payload; only the configuration gives their length.
-* Alive (id F0): empty. Errors (id FE): u8 - F0 checksum, F1 unknown command, F2 unknown sensor; errors of other lengths
-  are not in that program, and are skipped as noise.
+* Alive (id F0): empty. Errors (id FE): u8 - F0 checksum, F1 unknown command, F2 unknown sensor; 01 to EE is the length
+  of a text that follows (read_error): such errors are skipped as noise.
 
 The wire does not say of which type the values of a sensor are: option ``values``, for all sensors of a line. That
 program does not say of which unit the device's time is: option ``time_unit_us``.

@@ -47,6 +47,11 @@ def test_the_emulated_device_byte_for_byte() -> None:
     assert device.answers(command(0x99)) == [bytes.fromhex("F0 C4 FE F1 3B")]
     assert device.answers(command(0xF0)) == [bytes.fromhex("F0 C4 F0 C4")]
     assert device.answers(command(0xD0, bytes.fromhex("0200 01 C800 02 C800"))) == []
+    assert (
+        device.answers(bytes.fromhex("F0 C4 01 D0 02 00 F4 01 12")) == []
+    )  # of one sensor, as the maker's host sends it
+    assert device.answers(bytes.fromhex("F0 C4 01 D0 02 00 C8 00 2F")) == []
+    assert device.answers(bytes.fromhex("F0 C4 03 D0 02 00 C8 00 2D")) == [bytes.fromhex("F0 C4 FE F2 38")]
     frames = device.answers(START, 65)
     assert len(frames) in (6, 8)
     for at, frame in enumerate(frames):

@@ -59,7 +59,7 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         target, number = command[2:4]
         if functools.reduce(operator.xor, command):
             return message(0xFE, bytes([_BAD_CHECKSUM]))
-        if target:
+        if target > len(self.options.sensors) or (target and number != 0xD0):
             return message(0xFE, bytes([_NO_SUCH_SENSOR]))
         if number == 0xC0:
             each = b"".join(struct.pack("<HH", _TYPE, 2 * count) for count in self.options.sensors)
@@ -71,7 +71,8 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         elif number == 0xF1:
             self.start(device, now_ns, device.memory.get("period_s", self.options.period_ms / 1e3))
         elif number == 0xD0:
-            device.memory["period_s"] = max(1, int.from_bytes(command[7:9], "little")) * 1e-4
+            first = 6 if target else 7  # the last one sent holds for all sensors here
+            device.memory["period_s"] = max(1, int.from_bytes(command[first : first + 2], "little")) * 1e-4
             self.change_period(device, now_ns, device.memory["period_s"])
         else:
             return message(0xFE, bytes([_UNKNOWN]))
@@ -81,4 +82,5 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
 def _total(command: bytes) -> int:
     if len(command) < 4 or command[3] != 0xD0:
         return 5 if len(command) >= 4 else 0
-    return 7 + 3 * int.from_bytes(command[4:6], "little") if len(command) >= 6 else 0
+    each = 1 if command[2] else 3  # to a sensor, its period; to the device, numbers of sensors and periods
+    return 7 + each * int.from_bytes(command[4:6], "little") if len(command) >= 6 else 0

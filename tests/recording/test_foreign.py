@@ -112,6 +112,59 @@ def test_other_separators(tmp_path: Path, how: dict[str, str]) -> None:
     require(only(path), values)
 
 
+@pytest.mark.parametrize("separator", ["\t", ";"])
+def test_decimal_commas(tmp_path: Path, separator: str) -> None:
+    values, path = counts(N, 3), tmp_path / "data.csv"
+    write_csv(path, [], np.column_stack([TIMES, values]), header="", delimiter=separator, fmt="%.3f")
+    names = separator.join(["Zeit [s]", "s_0", "s_1", "s_2"])
+    path.write_text(names + "\n" + path.read_text().replace(".", ","), encoding="utf-8-sig")
+    require(only(path), values)
+
+
+@pytest.mark.parametrize(
+    ("head", "patches"),
+    [
+        ("time,taxel_0,taxel_1\ns,N,N\n", ["data"]),
+        (",left,right\n,s_0,s_0\ntime,,\n", ["left s", "right s"]),  # as pandas writes columns in two levels
+        ("# by a program\ntime,taxel_0,taxel_1\n# begins\n", ["data"]),
+    ],
+)
+def test_names_in_several_lines(tmp_path: Path, head: str, patches: list[str]) -> None:
+    path, values = tmp_path / "data.csv", counts(N, 2)
+    write_csv(path, [], np.column_stack([TIMES, values]), header="")
+    path.write_text(head + path.read_text().lstrip())
+    series = only(path)
+    require(series, values)
+    assert list(series.structure.patch_names) == patches
+    assert series.structure.type("pressure").unit == ("N" if "N," in head else "counts")
+
+
+@pytest.mark.parametrize(
+    ("text", "begin"),
+    [
+        ("2026-11-28 12:00:00.{:06d}+01:00", "2026-11-28T11:00"),
+        ("2026-11-28T12:00:00,{:06d}-0330", "2026-11-28T15:30"),
+        ("2026-11-28T12:00:00.{:06d}Z", "2026-11-28T12:00"),
+    ],
+)
+def test_dates_in_a_time_zone(tmp_path: Path, text: str, begin: str) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text("when;taxel_0\n" + "".join(f"{text.format(n * 10_000)};{n}\n" for n in range(9)))
+    require(only(path), np.arange(9)[:, None], TIMES[:9])
+    with skinware.recording.open(tmp_path / "made.mcap") as recording:
+        assert recording.start_ns == np.datetime64(begin, "ns").astype(int)
+
+
+@pytest.mark.parametrize("kind", ["m8[us]", "M8[us]"])
+@pytest.mark.parametrize("end", ["npz", "parquet"])
+def test_times_as_such(tmp_path: Path, kind: str, end: str) -> None:
+    """Also durations, and dates so near to 1970 that their size says nothing."""
+    values, path = counts(N, 1), tmp_path / f"data.{end}"
+    columns = {"since": np.rint(TIMES * 1e6).astype("i8").view(kind), "taxel_0": values[:, 0]}
+    np.savez(path, **columns) if end == "npz" else pa.parquet.write_table(pa.table(columns), path)
+    require(only(path), values)
+
+
 def test_missing_values_keep_the_last_one(tmp_path: Path) -> None:
     path = tmp_path / "gaps.csv"
     path.write_text("time,taxel_0,taxel_1\n0,,5\n1,1,\n2,nan,7\n3,4,8\n")
@@ -476,6 +529,18 @@ MISTAKES = [
         pa.table([TIMES, TIMES, TIMES], names=["time", "taxel_0", "taxel_0"]), path), "no column of numbers 'taxel_0'"),
     damaged("wide.npz", lambda path: np.savez_compressed(path, time=TIMES[:2], taxel_0=np.zeros((2, 1 << 21), bool)),
             "no column of numbers 'taxel_0'"),
+    damaged("thousand.csv", lambda path: path.write_text("time;taxel_0\n0.1;1,938\n0.2;12\n"),
+            "'0.1' and '1,938': is the comma or the point that of decimals? Export it without marks between thousands"),
+    damaged("marks.csv", lambda path: path.write_text("time;taxel_0\n1;1,938\n2;12\n"),
+            "is '1,938' a number of thousands?"),
+    damaged("point.csv", lambda path: path.write_text("time;taxel_0\n" + "0,5;1,5\n" * 500 + "1,0;1.938\n"),
+            "line 502: '1.938' is no number"),
+    damaged("zone.csv", lambda path: path.write_text("time,taxel_0\n" + "2026-11-28T12:00:00Z,1\n" * 500 + "12:00,1\n"),
+            "line 502: '12:00' in time is neither a date"),
+    damaged("a.csv.gz", lambda path: path.write_bytes(b"\x1f\x8b\x08" + bytes(50)), "packed by gzip: unpack it first"),
+    damaged("a.feather", lambda path: path.write_bytes(b"ARROW1" + bytes(50)), "Feather is not read: write it as"),
+    damaged("a.mat", lambda path: path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(150)), "MAT-files are not read"),
+    damaged("a.xlsx", lambda path: zipped(path, "[Content_Types].xml", b"<Types>"), "spreadsheet can be saved as CSV"),
     damaged("a.h5", lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(50)), "HDF5 is not read"),
     damaged("a.npy", lambda path: np.save(path, np.zeros(3)), "save it with numpy.savez"),
     damaged("cut.npz", lambda path: cut(path, lambda path: np.savez(path, t=TIMES)), "not an NPZ file, or damaged"),
@@ -554,8 +619,27 @@ def test_many_columns_with_numbers_are_taxels_beside_one_with_a_name(tmp_path: P
     assert "not taken for taxels: joint_0, joint_1, joint_2, joint_3" in text
 
 
+def test_numbers_too_large_for_the_first_guess(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text("time,taxel_0,taxel_1\n0,5000000000,1\n0.5,4294967296,inf\n")
+    require(only(path), np.array([[5e9, 1], [2**32, np.inf]], np.float32), np.arange(2) / 2)
+
+
+def test_a_rate_is_made_up_aloud(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text("time,taxel_0\n" + "".join(f"12:00:0{n},{n}\n" for n in range(5)))
+    assert "# MADE UP: no column rises like a time (time: '12:00:00' is no number)" in guess(open_source(path))
+
+
 def test_nothing_to_guess(tmp_path: Path) -> None:
     path = tmp_path / "joints.csv"
     write_csv(path, ["time", "joint_0"], np.column_stack([TIMES, counts(N, 1)]))
     with pytest.raises(ConfigurationError, match="nothing looks like taxels; columns of numbers: time, joint_0"):
+        guess(open_source(path))
+
+
+def test_columns_that_cannot_be_read_are_named_with_the_reason(tmp_path: Path) -> None:
+    path = tmp_path / "data.npz"
+    np.savez(path, time=TIMES, tactile=counts(N, 3).astype(object))
+    with pytest.raises(ConfigurationError, match=r"columns of numbers: time; others: tactile \(object of shape"):
         guess(open_source(path))

@@ -15,6 +15,10 @@ from skinware.errors import ConfigurationError
 __all__ = ["ColumnSource", "ImportedSource", "guess", "open_source"]
 
 _INSTEAD = {
+    b"\x1f\x8b": "packed by gzip: unpack it first",
+    b"\x28\xb5\x2f\xfd": "packed by zstd: unpack it first",
+    b"ARROW1": "Feather is not read: write it as Parquet",
+    b"MATLAB ": "MAT-files are not read: export their arrays by writematrix, or with numpy.savez",
     b"\x89HDF": "HDF5 is not read: export its arrays with numpy.savez, or as CSV",
     b"\x93NUMPY": "one array without a name: save it with numpy.savez",
 }

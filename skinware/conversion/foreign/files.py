@@ -44,14 +44,17 @@ class NpzSource(ColumnSource):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        with blamed(lambda reason: f"{path}: not an NPZ file, or damaged ({reason})"):
+        with blamed(
+            lambda reason: f"{path}: not an NPZ file, or damaged ({reason}); a spreadsheet can be saved as CSV"
+        ):
             self._zip = zipfile.ZipFile(path)
             self._arrays = {name.removesuffix(".npy"): self._head(name) for name in self._zip.namelist()}
         found = {
             name: each
             for name, each in self._arrays.items()
-            if each.dtype.kind in "iufbM" and each.shape and all(each.shape) and prod(each.shape[1:]) <= _MOST_NUMBERS
+            if each.dtype.kind in "iufbmM" and each.shape and all(each.shape) and prod(each.shape[1:]) <= _MOST_NUMBERS
         }
+        self.times = {name for name, each in found.items() if each.dtype.kind in "mM"}
         self.left_out = {
             name: f"{each.dtype} of shape {each.shape}" for name, each in self._arrays.items() if name not in found
         }
@@ -116,10 +119,10 @@ def _header(stream: IO[bytes]) -> _Array:
 
 
 def _plain(rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return times as int64, ns since 1970, the least number for none; other numbers as they are."""
-    if rows.dtype.kind != "M":
+    """Return times as int64, ns, dates since 1970, the least number for none; other numbers as they are."""
+    if rows.dtype.kind not in "mM":
         return rows
-    times = rows.astype("datetime64[ns]")  # which wraps
+    times = rows.astype(f"{rows.dtype.kind}8[ns]")  # which wraps
     return np.where(times.astype(rows.dtype) == rows, times.astype(np.int64), np.iinfo(np.int64).min)
 
 
@@ -138,6 +141,7 @@ class ParquetSource(ColumnSource):
                 row_bytes = max((row.nbytes for row in islice(file.iter_batches(1), 1)), default=0)
                 self._batch_rows = max(1, min(_BATCH_ROWS, BLOCK_BYTES // max(1, row_bytes)))
                 batches = list(islice(file.iter_batches(self._batch_rows), 1))
+        self.times = {name for name, kind in kinds.items() if kind.startswith(("timestamp", "date", "duration"))}
         shapes: dict[str, tuple[int, ...]] = {}
         for batch, name in product(batches, kinds):
             with contextlib.suppress(ConfigurationError, KeyError):  # or two columns of one name
@@ -171,7 +175,7 @@ class ParquetSource(ColumnSource):
         found = column.to_numpy(zero_copy_only=False)
         if str(column.type) in _TEXTS and not column.null_count:
             found = found.astype(str)
-        if found.dtype.kind not in "iufbMU":
+        if found.dtype.kind not in "iufbmMU":
             raise ConfigurationError(f"{path}: {name} is not numbers: leave it out")
         return _plain(found.reshape(shape))
 

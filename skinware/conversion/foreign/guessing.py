@@ -41,6 +41,9 @@ _UNITS = re.compile(r"[_.\s(\[](kpa|mpa|pa|mn|n|mt|ut|gauss|degc|g|mm|v|mv)[)\]]
 _UNIT_NAMES = {"kpa": "kPa", "mpa": "MPa", "pa": "Pa", "mn": "mN", "n": "N", "mt": "mT", "ut": "uT", "degc": "degC"}
 _AXIS = re.compile(r"(^|[_.\s])([xyz])(?=$|[_.\s\d])|(?<=[a-z])([XYZ])$")
 _NUMBER = re.compile(r"\d+")
+_SHOWN = 60
+"""Characters of a reason in a message."""
+_WHOLE = 1 << 31
 _MANY = 4
 """Columns whose names differ in numbers and axes alone: so many are taxels, whatever they are called."""
 _GENERIC = ("", "taxel", "taxels", "sensor", "s", "t", "value", "values", "data", "column", "tactile")
@@ -60,7 +63,7 @@ def guess(source: ColumnSource) -> str:
         OSError: it cannot be read.
     """
     tables = {table: first_rows(source, table) for table in source.tables}
-    times = {table: _time_of(rows) for table, rows in tables.items()}
+    times = {table: _time_of(rows, source) for table, rows in tables.items()}
     if len(tables) > 1 and any(times.values()):  # arrays of other lengths are places and the like
         chosen = [table for table in tables if times[table]]
     else:
@@ -71,19 +74,25 @@ def guess(source: ColumnSource) -> str:
         f"version = {VERSION}",
     ]
     name = "" if len(chosen) > 1 else source.path.stem
-    found = [_driver(table, tables, times[table], name or table) for table in chosen]
+    found = [_driver(source, table, tables, times[table], name or table) for table in chosen]
     if not any(found):
-        names = ", ".join(name for rows in tables.values() for name in rows) or "none"
-        raise ConfigurationError(f"{source.path}: nothing looks like taxels; columns of numbers: {names}")
+        raise ConfigurationError(f"{source.path}: nothing looks like taxels; {_overview(source, tables)}")
     for each in found:
         lines += each
     lines += [f"# left out: {name} ({why})" for name, why in source.left_out.items()]
     return "\n".join(lines) + "\n"
 
 
-def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> list[str]:
+def _overview(source: ColumnSource, tables: Mapping[str, Rows]) -> str:
+    in_tables = [f"{name} ({table})" if table else name for table, rows in tables.items() for name in rows]
+    others = [f"{name} ({why[:_SHOWN]})" for name, why in source.left_out.items()]
+    shown = [", ".join([*each[:_MANY], *["..."] * (len(each) > _MANY)]) for each in (in_tables, others)]
+    return f"columns of numbers: {shown[0] or 'none'}" + (f"; others: {shown[1]}" if others else "")
+
+
+def _driver(source: ColumnSource, table: str, tables: Mapping[str, Rows], time: str, driver: str) -> list[str]:
     rows = tables[table]
-    names = [name for name in rows if name != time]
+    names = [name for name in rows if name != time and name not in source.times]
     beside = {f"{name}_status" for name in names} | {
         f"{name.rpartition('.')[0]}.age" for name in names if "tactile" in name
     }
@@ -106,12 +115,12 @@ def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> l
              if each.shape[1:] == (3,) and _PLACES.search(name)}  # fmt: skip
     lines = ["", "[[driver]]", f"name = {_text(driver)}"]
     lines += [f"table = {_text(table)}"] if table else []
-    lines += _time_lines(rows, time)
+    lines += _time_lines(rows, time, source)
     values = [rows[name] for name in wanted]
-    is_whole = all(bool(np.all((each == np.rint(each)) | np.isnan(each))) for each in values)
+    is_whole = all(bool(np.all((each == np.rint(each)) & (np.abs(each) < _WHOLE) | np.isnan(each))) for each in values)
     dtypes = {each.dtype.name for each in values}
     dtype = next(iter(dtypes)) if dtypes <= {"uint8"} or dtypes <= {"int16"} or dtypes <= {"uint16"} else "int32"
-    dtype, why = (dtype, "whole numbers") if is_whole else ("float32", "fractions")
+    dtype, why = (dtype, "whole numbers") if is_whole else ("float32", "fractions or large numbers")
     lines += [f"dtype = {_text(dtype)}  # {why} in the first rows"]
     for module, count, why in modules:
         lines += ["", "[[driver.module]]", f"# {why}"]
@@ -126,9 +135,9 @@ def _driver(table: str, tables: Mapping[str, Rows], time: str, driver: str) -> l
 # -- time ---------------------------------------------------------------------------------------------------------
 
 
-def _time_of(rows: Rows) -> str:
+def _time_of(rows: Rows, source: ColumnSource) -> str:
     """Return the name of the column of times; empty: none looks like it."""
-    named = [name for name in rows if _TIMES.fullmatch(name) and _rises(rows[name])]
+    named = [name for name in rows if (_TIMES.fullmatch(name) or name in source.times) and _rises(rows[name])]
     preferred = ("time_s", "header.stamp", "stamp", "time")
     named.sort(key=lambda name: preferred.index(name) if name in preferred else len(preferred))
     fractions = [
@@ -145,12 +154,15 @@ def _rises(column: npt.NDArray[Any]) -> bool:
     return is_one and bool((numbers[1:] >= numbers[:-1]).all() and numbers[-1, 0] > numbers[0, 0])
 
 
-def _time_lines(rows: Rows, time: str) -> list[str]:
+def _time_lines(rows: Rows, time: str, source: ColumnSource) -> list[str]:
     if not time:
-        return ["rate_hz = 100  # no column rises like a time: this rate is made up"]
+        refused = next((f" ({name}: {why})" for name, why in source.left_out.items() if _TIMES.fullmatch(name)), "")
+        return [f"rate_hz = 100  # MADE UP: no column rises like a time{refused}"]
     numbers = rows[time].ravel().astype(np.float64)
     said, step = _UNIT_OF_TIME.search(time), float(np.median(np.diff(numbers))) or float(np.ptp(numbers)) / len(numbers)
-    if said:
+    if time in source.times:
+        unit, why = "ns", "times as such"
+    elif said:
         unit, why = {"sec": "s", "seconds": "s", "nsec": "ns"}.get(said[1].lower(), said[1].lower()), "its name says so"
     elif numbers[-1] > 1e8:
         unit = next(unit for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 0)) if numbers[-1] > least)

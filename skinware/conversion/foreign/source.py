@@ -15,7 +15,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError, SkinwareError
 
 Rows = dict[str, npt.NDArray[Any]]
-"""m rows of columns, (m, ...) by name: numbers; times that a file has as such are int64 ns since 1970."""
+"""m rows of columns, (m, ...) by name: numbers; times that a file has as such are int64 ns, dates since 1970."""
 BLOCK_BYTES = 4 << 20
 """Size of the rows that a source reads together."""
 
@@ -27,6 +27,7 @@ class ColumnSource(ABC):
         tables: columns by the name of their table: the shape of a row, () for one number. All columns of a table have
             equally many rows. The only table of a file has an empty name.
         left_out: by name, why something in it is no column of numbers; a column of texts can be read all the same.
+        times: columns of times as such, whose unit is ns.
         frames: by table, the name of the coordinate frame of its positions, where the source has one.
         share: part of the last pass over a table that is done, 0 to 1.
         marks: times of episodes, s on the axis of the data, and their names.
@@ -35,6 +36,7 @@ class ColumnSource(ABC):
 
     tables: Mapping[str, Mapping[str, tuple[int, ...]]]
     left_out: Mapping[str, str]
+    times: Collection[str] = ()
     frames: Mapping[str, str] = MappingProxyType({})
     marks: Sequence[tuple[float, str]] = ()
     share: float = 0.0

@@ -21,19 +21,23 @@ _SAMPLE_LINES = 200
 _SHOWN = 40
 """Characters of a cell in a message."""
 _SEPARATORS = ("\t", ";", ",")
-_MISSING = ("", "nan", "null", "none", "na", "n/a")
+_MISSING = ("", "-", "nan", "null", "none", "na", "n/a", "#n/a", "<na>")
 _EXACT = 1 << 53
 """From this number on, a float does not hold every integer."""
-_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d+)?Z?")
+_DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 _DUMPED = re.compile(r"\d+ \d+(\.\d+)? \S")
 _BRACKETS = str.maketrans("()", "  ")
+_COMMAS = str.maketrans(",.", ".,")
+"""Of a text with decimal commas; a point in it then makes no number."""
+_BY_COMMA, _BY_POINT = (re.compile(rf"[-+]?\d*{mark}\d+(e[-+]?\d+)?", re.I) for mark in (",", r"\."))
+_IN_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 
 
 class TextSource(ColumnSource):
     """A text with a row of numbers in each line; an empty cell is NaN.
 
-    Names of columns are in its first line; without one they are ``column_0``, ``column_1`` ... Separators are tabs,
-    semicolons (then a comma is a decimal point), commas, or any white space.
+    Names of columns are in its first lines; without them they are ``column_0``, ``column_1`` ... Separators are tabs,
+    semicolons (between both, numbers may have decimal commas), commas, or any white space.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,11 +51,12 @@ class TextSource(ColumnSource):
             raise ConfigurationError(f"{path}: no line with numbers in it: is it a text, as CSV is?")
         separators = (each for each in _SEPARATORS if each in data[0])
         self._separator = None if self._is_dump else next(separators, None)
+        self._letters = self._letters_of(data)
         self._count = count = len(self._cells(self._clean(data[0])))
         self._places = self._dumped(count) if self._is_dump else self._named(lines[: self._skipped], count)
         rows = [cells for line in data if len(cells := self._cells(self._clean(line))) == count]
         samples = {name: [cells[places[0]] for cells in rows] for name, places in self._places.items()}
-        self._dates = {name for name, cells in samples.items() if all(_DATE.fullmatch(cell.strip()) for cell in cells)}
+        self.times = {name for name, cells in samples.items() if all(_DATE.fullmatch(cell.strip()) for cell in cells)}
         self._exact = {
             name
             for name, cells in samples.items()
@@ -59,9 +64,9 @@ class TextSource(ColumnSource):
         }
         wrong = {name: [cell for cell in cells if _number(cell) is None] for name, cells in samples.items()}
         self.left_out = {
-            name: f"{cells[0][:_SHOWN]!r} is no number"
+            name: f"{self._shown(cells[0])} is no number"
             for name, cells in wrong.items()
-            if name not in self._dates and len(cells) > len(rows) / 2
+            if name not in self.times and len(cells) > len(rows) / 2
         }
         shapes = {
             name: (len(places),) if self._is_dump and name == "value" else () for name, places in self._places.items()
@@ -84,10 +89,12 @@ class TextSource(ColumnSource):
     # -- the form of the text -------------------------------------------------------------------------------------
 
     def _named(self, head: Sequence[str], count: int) -> dict[str, list[int]]:
-        line = next((line for line in reversed(head) if line.strip()), "")
-        names = [name.strip() for name in self._cells(line.lstrip("# "))] or [""] * count
-        if len(names) != count:
-            self._damaged(self._skipped + 1, f"{count} cells under {len(names)} names")
+        lines = [line.lstrip("# ") for line in reversed(head) if line.strip()]
+        named = [cells for line in lines if len(cells := self._cells(line)) == count]
+        if lines and not named:
+            self._damaged(self._skipped + 1, f"{count} cells under {len(self._cells(lines[0]))} names")
+        above = named[:1] if self._separator is None else reversed(named)  # a line of units, or of groups
+        names = [" ".join(filter(None, map(str.strip, cells))) for cells in zip(*above, strict=True)] or [""] * count
         names = [name or f"column_{number}" for number, name in enumerate(names)]
         for name, often in Counter(names).items():
             if often > 1:
@@ -101,9 +108,24 @@ class TextSource(ColumnSource):
         return {name: [number] for number, name in enumerate(names)} | {"value": list(range(len(names), count))}
 
     def _clean(self, line: str) -> str:
+        return line.translate(self._letters) if self._letters else line
+
+    def _letters_of(self, lines: Sequence[str]) -> dict[int, int]:
+        """Return the letters to exchange in each line, so that numbers have points."""
         if self._is_dump:
-            return line.translate(_BRACKETS)
-        return line.replace(",", ".") if self._separator == ";" else line
+            return _BRACKETS
+        if self._separator not in ("\t", ";"):
+            return {}
+        cells = [cell.strip() for line in lines for cell in self._cells(line)]
+        commas = [cell for cell in cells if _BY_COMMA.fullmatch(cell)]
+        points = [cell for cell in cells if _BY_POINT.fullmatch(cell)]
+        if commas and points:
+            why = f"{points[0]!r} and {commas[0]!r}: is the comma or the point that of decimals?"
+        elif commas and all(map(_IN_THOUSANDS.fullmatch, commas)):
+            why = f"is {commas[0]!r} a number of thousands?"
+        else:
+            return _COMMAS if commas else {}
+        raise ConfigurationError(f"{self.path}: {why} Export it without marks between thousands")
 
     def _cells(self, line: str) -> list[str]:
         if self._separator is None:
@@ -119,7 +141,7 @@ class TextSource(ColumnSource):
     # -- rows -----------------------------------------------------------------------------------------------------
 
     def _rows(self, lines: list[str], first: int, names: Collection[str]) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-        whole = [name for name in names if name in self._exact | self._dates]
+        whole = [name for name in names if name in self._exact | self.times]
         texts = [name for name in names if name in self.left_out]
         floats = [name for name in names if name not in (*whole, *texts)]
         places = [self._places[name] for name in floats]
@@ -155,15 +177,12 @@ class TextSource(ColumnSource):
         for line, cells in self._split(lines, first):
             cell = cells[place].strip()
             try:
-                if name in self._dates:
-                    date = np.datetime64(cell.removesuffix("Z"), "ns")  # which wraps
-                    if not str(date).startswith(cell[:4]):
-                        raise ValueError
-                    found.append(date.astype(np.int64))
+                if name in self.times:
+                    found.append(_date_ns(cell))
                 else:
                     found.append(np.int64(int(cell)))
             except (ValueError, OverflowError):
-                self._damaged(line, f"{cell[:_SHOWN]!r} in {name} is neither a date nor an integer of 64 bits")
+                self._damaged(line, f"{self._shown(cell)} in {name} is neither a date nor an integer of 64 bits")
         return np.array(found, np.int64)
 
     def _split(self, lines: list[str], first: int) -> Iterator[tuple[int, list[str]]]:
@@ -177,7 +196,7 @@ class TextSource(ColumnSource):
     def _float(self, cell: str, line: int) -> float:
         number = _number(cell)
         if number is None or (np.isinf(number) and "inf" not in cell.lower()):
-            self._damaged(line, f"{cell[:_SHOWN]!r} is {'no number' if number is None else 'out of range'}")
+            self._damaged(line, f"{self._shown(cell)} is {'no number' if number is None else 'out of range'}")
         return number
 
     def _lines_of(self, read: Sequence[bytes], at: int) -> list[str]:
@@ -192,6 +211,9 @@ class TextSource(ColumnSource):
             where = at + data.index(b"\0")
             raise ConfigurationError(f"{self.path}, byte {where}: not a text; what reads this file can export CSV")
         return [line.rstrip("\r") for line in text.removesuffix("\n").split("\n")]
+
+    def _shown(self, cell: str) -> str:
+        return repr(cell[:_SHOWN].translate(self._letters))
 
     def _damaged(self, line: int, what: str) -> NoReturn:
         raise ConfigurationError(f"{self.path}, line {line}: {what}: mend or remove the line")
@@ -216,3 +238,16 @@ def _number(cell: str) -> float | None:
         return None if "_" in cell else float(cell)
     except ValueError:
         return np.nan if cell.strip().lower() in _MISSING else None
+
+
+def _date_ns(cell: str) -> np.int64:
+    """Return ns since 1970, or raise ValueError."""
+    found = _DATE.fullmatch(cell)
+    if not found:
+        raise ValueError
+    date = np.datetime64(found[1] + (found[2] or "").replace(",", "."), "ns")  # which wraps
+    if not str(date).startswith(cell[:4]):
+        raise ValueError
+    zone = found[3] if found[3] not in (None, "Z") else "+00:00"
+    ahead = np.timedelta64(int(zone[:3]) * 60 + int(zone[0] + zone[-2:]), "m")
+    return np.int64((date - ahead).astype(np.int64))

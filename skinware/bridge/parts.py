@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from skinware import _names
 from skinware._columns import Index, as_index, texts
 from skinware.bridge.messages import Service, Wish
 from skinware.bridge.streaming import FrameStream
@@ -24,6 +23,7 @@ from skinware.memory.schema import Schema
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
 from skinware.tactile.regions import SensorChoice
+from skinware.text import names_in_patches
 from skinware.transfer.generation import Generation, RecordedDriverSnapshot
 
 _KEPT_NS = 10 * NS_PER_S
@@ -114,7 +114,7 @@ def _structure(
 ) -> Structure:
     """Return the structure of what stays; modules without a name of their own keep the one that readers showed."""
     own = texts(whole.module_name), texts(whole.module_kind), whole.module_patch.tolist()
-    module_names = _names.names_in_patches(*own)
+    module_names = names_in_patches(*own)
     types = set(whole.sensor_type[sensors].tolist())
     return whole.replace(
         types=[each for each in whole.types if each.id in types],

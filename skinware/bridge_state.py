@@ -98,7 +98,15 @@ class BridgeSample(Sample):
 
     @property
     def state(self) -> BridgeState:
-        return msgspec.json.decode(bytes(self.column("state").item()), type=BridgeState)
+        """Return the state.
+
+        Raises:
+            BadServiceFile: another program published something else.
+        """
+        try:
+            return msgspec.json.decode(bytes(self.column("state").item()), type=BridgeState)
+        except msgspec.MsgspecError as error:
+            raise BadServiceFile(f"service {self.context!r} publishes no state of a bridge ({error})") from None
 
 
 class BridgeReader(ServiceReader[BridgeSample]):
@@ -114,11 +122,12 @@ class BridgeReader(ServiceReader[BridgeSample]):
 
     frame_class = BridgeSample
 
-    def _describe(self, attached: segments.Segment) -> None:
+    def _describe(self, attached: segments.Segment) -> str:
         column = attached.schema.columns.get("state")
         is_bridge = bytes(attached.header["kind"]) == KIND.encode()
         if not is_bridge or column is None or (column.dtype, column.shape) != (_STATE.dtype, _STATE.shape):
             raise BadServiceFile(f"service {self.name!r} is no state of a bridge")
+        return self.name
 
 
 class BridgeStateWriter(ServiceWriter):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import sys
 import time
@@ -17,6 +18,7 @@ from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.drivers import Drivers
 from skinware.errors import (
+    BadServiceFile,
     ConfigurationError,
     NamespaceError,
     Overrun,
@@ -193,8 +195,13 @@ class LiveBridges(Drivers[BridgeReader]):
         super().__init__(namespace, BridgeReader)
 
     def states(self) -> list[BridgeState]:
-        samples = [self.newest(name) for name in list(self.readers)]
-        return [sample.state for sample in samples if sample is not None and not sample.stale]
+        """Return the states of living bridges, without those that cannot be read (skin-info names them)."""
+        states = []
+        for sample in map(self.newest, list(self.readers)):
+            if sample is not None and not sample.stale:
+                with contextlib.suppress(BadServiceFile):
+                    states.append(sample.state)
+        return states
 
 
 class LiveSources(Drivers[SourceReader[SampleT]], Generic[SampleT]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import threading
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from skinware.cli.top import show_lines
 from skinware.errors import BadServiceFile
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.views.live import LiveBridges
 from skinware_drivers.doctor.examining import examine
 from skinware_drivers.doctor.rules import Severity
 from skinware_drivers.testing.waiting import wait_until
@@ -66,6 +68,19 @@ def test_another_service_is_refused(namespace: Namespace) -> None:
         pytest.raises(BadServiceFile, match="no state of a bridge"),
     ):
         BridgeReader("x", namespace=namespace)
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"\xff", b"[]", b'{"robot": 1}'])
+def test_a_state_that_is_none_is_named_and_left_out(namespace: Namespace, text: bytes) -> None:
+    with BridgeStateWriter("walle", namespace) as writer, telling(replace(state(), robot="eve"), namespace):
+        writer.begin()["state"][...] = text
+        writer.commit(now_ns())
+        (problem,) = report(namespace)["problems"]
+        assert problem.startswith("service 'walle-bridge' publishes no state of a bridge (")
+        assert "\n" not in problem
+        with contextlib.closing(LiveBridges(namespace)) as live:
+            live.look()
+            assert [each.robot for each in live.states()] == ["eve"]
 
 
 def test_a_bridge_tells_how_it_is_where_its_services_appear(namespace: Namespace) -> None:

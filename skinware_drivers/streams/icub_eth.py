@@ -20,7 +20,7 @@ from skinware_drivers.layout import Layout
 from skinware_drivers.link import Link
 from skinware_drivers.options import Options
 from skinware_drivers.serial.adapter import SerialAdapter
-from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.serial.framing import Field, Framer, Framing, Splitting
 from skinware_drivers.serial.framings import Split
 from skinware_drivers.serial.packets import Length, Packet
 
@@ -33,22 +33,35 @@ _SKIN = 0x0300_0002
 _ITEM, _LONGEST_CAN = 10, 8
 
 
+class _Rops(Split):
+    def framer(self) -> Framer:
+        framer = super().framer()
+        framer.splitting = _in_order(self.splitting)
+        return framer
+
+
 def rops(port: int) -> Split:
     """Return the framing that finds the CAN frames of the skin on a CAN port, 1 or 2.
 
-    A frame that one of the next 64 has overtaken becomes one that is too long for CAN, and that the bus refuses.
+    A frame that one of the next 64 of its stream has overtaken becomes one that is too long for CAN, and that the bus
+    refuses.
     """
+    wanted = _SKIN | (port - 1) << 8
+    return _Rops(_FRAMES, lambda _, body: _can_frames(body[_NUMBER:], wanted))
+
+
+def _in_order(splitting: Splitting) -> Splitting:
     newest = 0
 
-    def split(_: int, body: bytes) -> Iterable[tuple[int, bytes]]:
+    def split(identifier: int, body: bytes) -> Iterable[tuple[int, bytes]]:
         nonlocal newest
         number = int.from_bytes(body[:_NUMBER], "little")
         if 0 < newest - number <= _OVERTAKEN:
             return [(0, bytes(_LONGEST_DATAGRAM))]
         newest = number
-        return _can_frames(body[_NUMBER:], _SKIN | (port - 1) << 8)
+        return splitting(identifier, body)
 
-    return Split(_FRAMES, split)
+    return split
 
 
 def _can_frames(operations: bytes, wanted: int) -> Iterator[tuple[int, bytes]]:

@@ -50,6 +50,13 @@ def test_an_overtaken_frame_becomes_one_that_the_bus_refuses() -> None:
     assert len(framer.feed(DATAGRAM[:16] + bytes(8) + DATAGRAM[24:])[0].body) == 8  # the board begins again
 
 
+def test_a_new_stream_begins_with_any_number() -> None:
+    framing = rops(1)
+    for number in (12, 9):  # a board restarted while its bus was away
+        frames = framing.framer().feed(DATAGRAM[:16] + number.to_bytes(8, "little") + DATAGRAM[24:])
+        assert [len(frame.body) for frame in frames] == [8, 8]
+
+
 @pytest.mark.parametrize(
     ("there", "instead", "frames"),
     [

@@ -80,6 +80,14 @@ def test_emulated_skintalk() -> None:
     assert hardware.emit(10**12 + 2000 * MS) == []
 
 
+def test_octocan3_has_commands_of_its_own(emulated_skin: Callable[..., EmulatedSkin]) -> None:
+    options = {"firmware": "octocan3", "patches": (1,)}
+    skin = emulated_skin(SkintalkDriver, EmulatedSkintalk, driver_options=options, **options)
+    read_until(skin.reader, is_fresh)
+    skin.reader.call("calibrate")
+    read_until(skin.reader, is_fresh)
+
+
 # -- framing
 
 

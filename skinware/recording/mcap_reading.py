@@ -118,7 +118,9 @@ class McapSource:
             raise BadRecording(f"{path}: compressed by {how}; recordings are by {COMPRESSION}")
         if not self.chunks and self._data[: len(MAGIC)] != MAGIC:
             self.close()
-            raise BadRecording(f"{path}: not a recording (not an MCAP file)")
+            raise BadRecording(
+                f"{path}: not a recording (not an MCAP file); skin-convert --guess begins with data of others"
+            )
 
     @property
     def size(self) -> int:

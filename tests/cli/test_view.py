@@ -148,7 +148,7 @@ def test_recordings_are_in_the_address_or_refused(
     assert what == "a b.mcap, a b.mcap, torso (Ctrl-C ends)\n"
     Path("foreign.mcap").write_text("hello")
     for name, why in (
-        ("foreign.mcap", "not a recording (not an MCAP file)"),
+        ("foreign.mcap", "not a recording (not an MCAP file); skin-convert --guess begins with data of others"),
         ("gone.mcap", "No such file or directory"),
     ):
         assert exit_status(view, ["--no-browser", name]) == 2

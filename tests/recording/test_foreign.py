@@ -549,6 +549,8 @@ MISTAKES = [
     damaged("old", lambda path: write_dataset(path, [3], "v2.1"), "a dataset of LeRobot v2.1: convert it to v3.0"),
     damaged("empty", lambda path: path.mkdir(), "a folder without metadata.yaml"),
     damaged("bad.bag", lambda path: path.write_bytes(b"#ROSBAG V2.0\n" + bytes(50)), "no bag of ROS, or damaged"),
+    damaged("own.mcap", lambda path: path.write_bytes(b"\x89MCAP0\r\n\1\x1e" + bytes(7) + b"\x08\0\0\0skinware"),
+            "a recording already, which needs no map"),
     damaged("bad.mcap", lambda path: path.write_bytes(b"\x89MCAP0\r\n" + bytes(50)), "no bag of ROS, or damaged"),
 ]  # fmt: skip
 

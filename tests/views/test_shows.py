@@ -225,7 +225,7 @@ def test_files_that_are_no_recordings_get_one_line(serving: Serve, recording: Pa
     (folder / "cut.mcap").write_bytes(recording.read_bytes()[: len(data) // 2])
     files = RecordingFiles(folder=folder)
     lines: dict[str, Any] = {
-        "foreign.mcap": "foreign.mcap: not a recording (not an MCAP file)",
+        "foreign.mcap": "(not an MCAP file); skin-convert --guess begins with data of others",
         "gone.mcap": "gone.mcap: there is no such file where skin-view was started",
         "cut.mcap": "cut: its end is missing; skin-recover completes it",
         "damaged.mcap": "damaged: 1 chunk damaged and left out",

@@ -22,6 +22,8 @@ _INSTEAD = {
     b"\x89HDF": "HDF5 is not read: export its arrays with numpy.savez, or as CSV",
     b"\x93NUMPY": "one array without a name: save it with numpy.savez",
 }
+_MCAP_HEAD = 64
+"""Bytes that show which program wrote an MCAP file."""
 
 
 def open_source(path: Path) -> ColumnSource:
@@ -47,10 +49,12 @@ def open_source(path: Path) -> ColumnSource:
             return ParquetSource(path)
         raise ConfigurationError(f"{path}: a folder without metadata.yaml, meta/info.json, data.log or Parquet files")
     with path.open("rb") as file:
-        begin = file.read(13)
+        begin = file.read(_MCAP_HEAD)
     for magic, why in _INSTEAD.items():
         if begin.startswith(magic):
             raise ConfigurationError(f"{path}: {why}")
+    if begin.startswith(b"\x89MCAP") and b"skinware" in begin:
+        raise ConfigurationError(f"{path}: a recording already, which needs no map")
     if begin.startswith((b"#ROSBAG", b"\x89MCAP", b"SQLite format")):
         return BagSource(path)
     if begin.startswith(b"PK"):

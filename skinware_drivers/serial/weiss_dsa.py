@@ -1,12 +1,14 @@
 """Weiss Robotics' DSACON32m, the controller of the tactile matrices of Schunk's hand SDH (six DSA matrices).
 
-Wire format: the makers' SDHLibrary (dsa.h and dsa.cpp, Schunk 2008 to 2010, as in github.com/skyellen/robwork-mirror).
+Wire format: the makers' SDHLibrary (dsa.h and dsa.cpp, Schunk 2008 to 2010, as in github.com/skyellen/robwork-mirror;
+0.0.2.10 of 2015 as in ipab-slmc/SDHLibrary-CPP, 0217d4e).
 115200 baud. Frames: ``AA AA AA | command | length u16 LE | payload | CRC u16 LE`` over command, length and payload,
 with the CRC of the WTS; a frame without payload has none. An answer begins with an error u16 LE.
 
 * ``02`` -> error, matrices u16, 8 more bytes. ``0B | matrix`` -> 52 bytes: error, width and height of a cell (mm,
   float32), columns u16, rows u16, ...
-* ``03 | flags | frames per second u16`` -> error. Flags: 80 acquire, 01 run lengths. Any rate above 0 is the highest.
+* ``03 | flags | frames per second u16`` -> error. Flags: 80 acquire, 01 run lengths. Any rate above 0 is the highest;
+  0 with 80 is a single frame, but starts firmware up to 288 except 269 (cDSA::ReadFrame).
 * Data: command 0, time in ms u32, flags, cells u16 of 12 bits: matrix by matrix, row by row.
 
 Not known: two programs disagree on where run-length coded data begin, so the driver requests them only if
@@ -129,7 +131,7 @@ class WeissDsaDriver(WeissAdapter[WeissDsaOptions]):
 
     async def stop(self, link: Link) -> None:
         try:
-            await self._ask(link, _ACQUIRE, struct.pack("<BH", _ON, 0))
+            await self._ask(link, _ACQUIRE, struct.pack("<BH", _RLE, 0))  # as the makers' library
         except Refused as error:
             link.log.debug("%s", error)
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import struct
 
 import numpy as np
 import pytest
 
 from skinware.errors import ConfigurationError
+from skinware_drivers.link import Link
+from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.framing import Framed
 from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _expanded, _Matrix
 from skinware_drivers.testing.driving import emulated_skin
@@ -16,6 +19,7 @@ from tests.sdk.driving import read_until
 from tests.serial.spoken import Spoken
 
 START_30_FPS_WITH_RUNS = bytes.fromhex("AA AA AA 03 03 00 81 1E 00 2C 76")
+STOP = bytes.fromhex("AA AA AA 03 03 00 01 00 00 2F 6A")  # as the maker's program sends it
 MATRICES = bytes.fromhex("AA AA AA 02 00 00")
 
 
@@ -42,8 +46,24 @@ def test_the_emulated_controller_byte_for_byte() -> None:
     assert first == message(0x03, b"\0\0")
     cells = np.frombuffer(_expanded(frame[11:-2]), "<u2")
     assert cells.tolist() == [0] * 162
-    assert controller.answers(message(0x03, b"\x80\0\0"))[-1] == message(0x03, b"\0\0")
+    assert controller.answers(STOP)[-1] == message(0x03, b"\0\0")
     assert controller.answers(b"", 500) == []
+    first, frame = controller.answers(message(0x03, b"\x80\0\0"), 500)
+    assert first == message(0x03, b"\0\0")
+    assert len(frame) == 8 + 5 + 2 * 162
+
+
+def test_a_controller_is_stopped_as_by_the_makers_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the flag for data, a rate of 0 asks for a single frame."""
+    asked = list[bytes]()
+
+    async def ask(_driver: object, _link: Link, command: int, payload: bytes, **_more: object) -> bytes:
+        asked.append(WeissDsaDriver.framing.encode(command, payload))
+        return b""
+
+    monkeypatch.setattr(WeissDsaDriver, "_ask", ask)
+    asyncio.run(WeissDsaDriver(WeissDsaOptions()).stop(Link(make_bus("/dev/null"))))
+    assert asked == [STOP]
 
 
 @pytest.mark.parametrize("options", [{}, {"rle_offset": 5}])
@@ -56,7 +76,7 @@ def test_data_of_both_codings_become_matrices(options: dict[str, int]) -> None:
         assert structure.module_name[:2].tolist() == [b"finger 1 proximal", b"finger 1 distal"]
         assert structure.geometry is not None
         assert structure.geometry.known.all()
-        assert skin.reader.call("controller") == {"bus0": {"serial_number": 4711, "hardware": 2, "software": 258}}
+        assert skin.reader.call("controller") == {"bus0": {"serial_number": 4711, "hardware": 2, "software": 300}}
 
 
 def test_run_lengths_that_do_not_make_a_frame_are_not_shown() -> None:

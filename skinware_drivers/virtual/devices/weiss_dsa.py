@@ -43,7 +43,7 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
         if arguments and crc(command[3:-2]) != int.from_bytes(command[-2:], "little"):
             return message(number, struct.pack("<H", _WRONG))
         if number == 0x01:
-            return message(number, struct.pack("<HIBHBBBBIH", _OK, 4711, 2, 0x0102, 0, 0, 0, 0, 0, 0)[:18])
+            return message(number, struct.pack("<HIBHBBBBIH", _OK, 4711, 2, 300, 0, 0, 0, 0, 0, 0)[:18])
         if number == 0x02:
             return message(number, struct.pack("<HHHBIB", _OK, len(self._rows), 0, 1, 42, 0))
         if number == 0x0B and len(arguments) == 1 and arguments[0] < len(self._rows):
@@ -54,7 +54,10 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
             device.memory["runs"] = bool(arguments[0] & 1)
             if arguments[0] & 0x80 and any(arguments[1:]):
                 self.start(device, now_ns)
-            return message(number, struct.pack("<H", _OK))
+            self.say(device, message(number, struct.pack("<H", _OK)), now_ns)
+            if arguments[0] & 0x80 and not any(arguments[1:]):
+                self.burst(device, now_ns)  # a single frame, as the maker's program asks for it
+            return b""
         return None
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002

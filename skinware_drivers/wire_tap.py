@@ -86,15 +86,12 @@ class WireTap:
             yield data[begin:end]
         self._kept.size = 0
 
-    def keep_rows(
-        self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64], is_fd: npt.NDArray[np.bool_] | None = None
-    ) -> None:
+    def keep_rows(self, wire: npt.NDArray[np.void], time_ns: npt.NDArray[np.int64]) -> None:
         """Keep frames of a batch, unless its frames can be longer than those of CAN.
 
         Args:
             wire: (n,) of :func:`skinware_drivers.bus.wire_dtype`.
             time_ns: (n,) int64.
-            is_fd: (n,) bool, which are CAN FD, if their flags may not show it.
         """
         known = wire.dtype["payload"].shape[0]
         if known > _FD_PAYLOAD:
@@ -111,8 +108,6 @@ class WireTap:
             for name in ("identifier", "length", "flags"):
                 rows[name] = wire[name][some]
             rows["payload"][:, :known] = wire["payload"][some]
-            if is_fd is not None:
-                rows["flags"][is_fd[some]] |= IS_FD
             rows["flags"][rows["length"] > known] |= IS_CUT
             rows["length"] = np.minimum(rows["length"], known)
             # behind a short frame there are bytes of earlier frames

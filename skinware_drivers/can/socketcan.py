@@ -1,4 +1,4 @@
-"""SocketCAN in batches: C moves all frames that have arrived into the rows of a batch (``receiving.c``).
+"""SocketCAN in batches: one ``recvmmsg`` moves many frames into the rows of a batch (``native/receiving.c``).
 
 Every frame carries the kernel's own time stamp, and the kernel counts the frames that it drops.
 """
@@ -6,11 +6,13 @@ Every frame carries the kernel's own time stamp, and the kernel counts the frame
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import fcntl
 import os
 import socket
 import struct
+import time
 from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal
 
@@ -20,20 +22,21 @@ import numpy as np
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware.realtime import now_ns
 from skinware.status import BusReason, Unused
+from skinware.wire import IS_FD
+from skinware_drivers import native
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, Filter, FrameBatch, KernelBus, identifier_text
-from skinware_drivers.can.receiving import (
+from skinware_drivers.can.controller import (
     CONTROLLER_STATES,
     NO_CAN,
     ControllerHealth,
-    MessageRows,
-    Stamper,
     has_hardware_stamps,
     is_missing,
     read_controller,
-    rows_of,
+    stamp_frames,
 )
 from skinware_drivers.native import structs
-from skinware_drivers.native.structs import Source
+from skinware_drivers.native.compiling import compile_batch
+from skinware_drivers.native.device_time import DeviceClock
 from skinware_drivers.options import options_from_strings
 
 # linux/can.h, linux/can/raw.h, asm-generic/socket.h, linux/sockios.h; CPython lacks the names
@@ -42,6 +45,7 @@ _CAN_RAW_FILTER = 1
 _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _CANFD_BRS = 0x01
+_CLASSIC_PAYLOAD = 8
 _FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 _ALL_ERRORS = 0x1FFF_FFFF
 _SO_RCVBUFFORCE = 33
@@ -52,6 +56,7 @@ MOST_FILTERS = 512
 _AWAY = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO)
 
 _FLAGS_AT = 5  # in struct canfd_frame
+_CLOCK_PART_NS, _CLOCK_JUMP_NS = 250_000_000, 10_000_000  # of the clock of a controller
 _SMALL_BUFFER = 1 << 17  # it may be full before so many frames wait that C asks for losses
 
 WANTED_BUFFER_BYTES = 8 << 20
@@ -100,13 +105,13 @@ class SocketCanBus(KernelBus):
         self.narrows: bool = self._wanted.filter == "on"
         self._filters: Sequence[Filter] = ()
         self._socket: socket.socket | None = None
-        self._dropped_before = 0
         self.granted_buffer: int = 0
-        self._stamper = Stamper()
+        self._can = structs.CanSocket(speed_up=1.0)
+        self._clock: DeviceClock | None = None
+        self._batch, self._rows = FrameBatch(0), structs.Batch()
         self._health = ControllerHealth()
         self._is_bound = False
         self._restarts_itself = True
-        self._speed_up = 1.0
 
     def open(self) -> None:
         try:
@@ -149,12 +154,18 @@ class SocketCanBus(KernelBus):
         except PermissionError:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
         self.granted_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
-        wants_hardware = self._wanted.timestamps != "software"
-        self._stamper = Stamper(wants_hardware and has_hardware_stamps(sock, self.channel))
-        self._stamper.switch_on(sock)
+        has_clock = self._wanted.timestamps != "software" and has_hardware_stamps(sock, self.channel)
+        stamp_frames(sock, has_clock)
+        self._clock = None
+        if has_clock:
+            self._clock = DeviceClock(1e-9, 1 << 62, part_ns=_CLOCK_PART_NS, jump_ns=_CLOCK_JUMP_NS)
         sock.setblocking(False)
         self._socket = sock
-        self._dropped_before = self.counters.dropped
+        can, time_ns = self._can, now_ns()
+        can.fd, can.clock = sock.fileno(), None if self._clock is None else ctypes.addressof(self._clock.state)
+        can.offset_ns, can.last_poll_ns = time_ns - time.time_ns(), time_ns
+        can.dropped_before = can.dropped = self.counters.dropped
+        can.is_small = self.granted_buffer < _SMALL_BUFFER
 
     @property
     def note(self) -> str:
@@ -165,7 +176,7 @@ class SocketCanBus(KernelBus):
                 f"bus {self.channel}: receive buffer of {self.granted_buffer} bytes granted, {self._wanted.buffer}"
                 f" wanted; for more, run with CAP_NET_ADMIN or: sysctl net.core.rmem_max={self._wanted.buffer}"
             )
-        if self._socket and self._wanted.timestamps == "hardware" and not self._stamper.hardware:
+        if self._socket and self._wanted.timestamps == "hardware" and self._clock is None:
             notes.append(f"bus {self.channel}: its controller gives no time stamps; the kernel's are taken instead")
         if not self._restarts_itself:
             notes.append(
@@ -204,59 +215,53 @@ class SocketCanBus(KernelBus):
         return self._socket.fileno() if self._socket else -1
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        if self._socket is None:
+        source, call = structs.Source(bus=ordinal), native.library().quick
+        if not self._describe(source):
             raise BusNotAvailable(f"bus {self.channel} is not open")
-        if not batch.free:
-            return 0
-        rows, first, source = rows_of(batch), batch.stop, structs.Source(bus=ordinal)
-        self._lend(self._socket, rows, source)
-        if self._stamper.hardware:
-            rows.forget(slice(first, batch.limit))
-        count = rows.receive(batch, source)
-        if count < 0:
-            return self.nothing_received(-count)
-        new = slice(first, first + count)
-        if self._stamper.hardware:
-            batch.time_ns[new] = self._stamper.by_controller(rows.hardware_ns(new), batch.time_ns[new])
-        if self.tap.is_open:
-            self.tap.keep_rows(batch.wire[new], batch.time_ns[new], rows.are_fd(new))
-        source.frames = kept = self.sort_out(batch, new)
-        batch.stop += kept
-        if self.bit_rate:
-            source.wire_bits = rows.wire_bits(first, kept, self._speed_up)
-        self._count(source)
-        return kept
+        if batch is not self._batch:
+            self._batch, self._rows = batch, compile_batch(batch, structs.Arrays())
+        can, rows, begin = ctypes.byref(self._can), self._rows, batch.stop
+        while batch.free:
+            first = rows.stop = batch.stop
+            rows.limit = batch.limit
+            count = call.skinware_can_receive(ctypes.byref(source), ctypes.byref(rows))
+            if count < 0:
+                self.nothing_received(-count)
+            if count <= 0:
+                break
+            kept = self.sort_out(batch, slice(first, first + count))
+            batch.stop += kept
+            call.skinware_can_count(can, ctypes.byref(rows), ctypes.c_int64(first), ctypes.c_int64(kept))
+        call.skinware_can_look(can)
+        self._take_counts()
+        return batch.stop - begin
 
     @property
     def reads_natively(self) -> bool:
-        """Whether frames have the kernel's stamps; the clock of a controller is followed in Python."""
-        return not self._stamper.hardware
-
-    def hand_over(self, batch: FrameBatch, source: Source) -> bool:
-        if self._socket is None or not self.reads_natively:
-            return False
-        self._lend(self._socket, rows_of(batch), source)
-        source.stream, source.tap, source.frames = None, self.tap.address, 0
-        source.is_counted, source.speed_up, source.wire_bits = self.bit_rate > 0, self._speed_up, 0.0
-        source.is_small, source.fullest = self.granted_buffer < _SMALL_BUFFER, 0.0
         return True
 
-    def take_back(self, source: Source) -> None:
-        self._count(source)
-        if source.frames:
+    def hand_over(self, batch: FrameBatch, source: structs.Source) -> bool:  # noqa: ARG002
+        return self._describe(source)
+
+    def take_back(self, source: structs.Source) -> None:  # noqa: ARG002
+        self._take_counts()
+        if self._can.is_heard:
             self._health.heard_data()
 
-    def _lend(self, sock: socket.socket, rows: MessageRows, source: Source) -> None:
-        source.fd, source.headers, source.control = sock.fileno(), rows.headers_address, rows.control.ctypes.data
-        source.offset_ns, source.last_poll_ns = self._stamper.offset_ns, self._stamper.last_poll_ns
-        source.dropped_before, source.dropped = self._dropped_before, self.counters.dropped
+    def _describe(self, source: structs.Source) -> bool:
+        can = self._can
+        source.fd, source.can, source.tap = can.fd, ctypes.addressof(can), self.tap.address
+        can.is_counted = self.bit_rate > 0
+        can.frames = can.is_heard = 0
+        can.wire_bits = can.fullest = 0.0
+        return self._socket is not None
 
-    def _count(self, source: Source) -> None:
-        self._stamper.offset_ns, self._stamper.last_poll_ns = source.offset_ns, source.last_poll_ns
-        self.counters.frames += source.frames
-        self.counters.dropped = source.dropped
-        self.wire_bits += source.wire_bits
-        self.fullest: float = max(self.fullest, source.fullest)
+    def _take_counts(self) -> None:
+        can = self._can
+        self.counters.frames += can.frames
+        self.counters.dropped = can.dropped
+        self.wire_bits += can.wire_bits
+        self.fullest = max(self.fullest, can.fullest)
 
     def send(self, identifier: int, payload: bytes) -> None:
         sock = self.may_send_by(self._socket)
@@ -294,7 +299,7 @@ class SocketCanBus(KernelBus):
         self._restarts_itself = controller.restart_ms > 0
         self.bit_rate = 0 if self.narrows else controller.bit_rate  # filtered frames cannot be counted
         if controller.bit_rate and controller.data_bit_rate:
-            self._speed_up = controller.data_bit_rate / controller.bit_rate
+            self._can.speed_up = controller.data_bit_rate / controller.bit_rate
         if controller.state is not None and controller.state < len(CONTROLLER_STATES):
             self._health.believe(CONTROLLER_STATES[controller.state])
             self.counters.bus_offs = self._health.bus_offs
@@ -309,15 +314,12 @@ class SocketCanBus(KernelBus):
 
     def sort_out(self, batch: FrameBatch, new: slice) -> int:
         """Remove rows that are no data frames of this layout from new rows of a batch; return how many are left."""
-        rows, wire, first = rows_of(batch), batch.wire[new], new.start
-        identifier = wire["identifier"]
-        is_usual = not int(np.bitwise_or.reduce(identifier)) & (ERROR_FLAG | REMOTE_FLAG) and not rows.cut(new).any()
-        if is_usual and (not len(wire) or int(wire["length"].max()) <= batch.payload_size):
-            self._health.heard_data()
-            return len(wire)
+        wire, first = batch.wire[new], new.start
+        identifier, is_foreign = wire["identifier"], wire["length"] > batch.payload_size
+        if batch.payload_size == _CLASSIC_PAYLOAD:
+            is_foreign |= (wire["flags"] & np.uint8(IS_FD)) != 0
         is_error = (identifier & np.uint32(ERROR_FLAG)) != 0
-        other = ((identifier & np.uint32(REMOTE_FLAG)) != 0) | (wire["length"] > batch.payload_size) | rows.cut(new)
-        other &= ~is_error
+        other = (((identifier & np.uint32(REMOTE_FLAG)) != 0) | is_foreign) & ~is_error
         self.counters.errors += int(np.count_nonzero(is_error))
         self.counters.refused += int(np.count_nonzero(other))
         self.samples.take(Unused.REFUSED, wire[other])

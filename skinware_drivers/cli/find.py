@@ -84,7 +84,7 @@ async def look(
     import msgspec
 
     from skinware.errors import BusNotAvailable
-    from skinware_drivers.can.receiving import NO_CAN
+    from skinware_drivers.can.controller import NO_CAN
     from skinware_drivers.finding.guess import known_drivers
     from skinware_drivers.finding.interfaces import (
         NO_INTERFACE,

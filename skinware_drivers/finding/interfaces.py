@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from skinware_drivers.can.receiving import Controller, read_controller
+from skinware_drivers.can.controller import Controller, read_controller
 from skinware_drivers.finding.ports import text_of
 
 _STATES = ("ERROR-ACTIVE", "ERROR-WARNING", "ERROR-PASSIVE", "BUS-OFF", "STOPPED", "SLEEPING")

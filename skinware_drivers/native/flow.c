@@ -28,7 +28,7 @@ static struct source *source_of(const struct flow *flow, int fd)
 
 static bool receive_from(struct path *path, struct source *source)
 {
-    return source->asker ? receive_asked(path, source) : (source->stream ? receive_line : receive)(path, source);
+    return (source->asker ? receive_asked : source->stream ? receive_line : receive)(path, source);
 }
 
 /* Fill the batch from buses, each with its share; how many of them had something, and whether one has more. */

@@ -37,17 +37,23 @@ struct asker { /* a Modbus master */
     const uint32_t *crc_table;
 };
 
-struct source { /* a serial line, or a socket whose datagrams are struct can_frame or canfd_frame, with stamps */
-    int64_t fd, bus;                           /* fd: as it is known in `epoll_fd`, -1: it is gone */
-    struct stream *stream;                     /* of a line */
-    struct asker *asker;                       /* of one on which we ask; neither: what follows tap is of a socket */
-    struct tap *tap;                           /* NULL: nobody wants what comes */
-    int64_t headers, control;                  /* addresses of a mmsghdr and of 8 words for every row of the batch */
-    int64_t offset_ns, last_poll_ns;           /* CLOCK_MONOTONIC - CLOCK_REALTIME, and when that was */
-    int64_t dropped_before, dropped, frames, heard_ns; /* dropped: ever; frames: since Python looked */
-    int64_t is_counted, is_watched;            /* bits on the wire are; Python wants to know that frames come */
-    int64_t is_small;                          /* its buffer is full after a few frames */
+struct can_socket { /* its datagrams are struct can_frame or canfd_frame, with stamps */
+    int64_t fd;
+    struct device_clock *clock;      /* of a controller that stamps, too; NULL: only the kernel does */
+    int64_t offset_ns, last_poll_ns; /* CLOCK_MONOTONIC - CLOCK_REALTIME, and when that was */
+    int64_t dropped_before, dropped; /* ever */
+    int64_t frames, is_heard;        /* since Python looked; whether data came after all that Python sorted out */
+    int64_t is_counted, is_small;    /* bits on the wire are; its buffer is full after a few frames */
     double speed_up, wire_bits, fullest;
+};
+
+struct source { /* a serial line, a line on which we ask, or a socket: one of the pointers is not NULL */
+    int64_t fd, bus; /* fd: as it is known in `epoll_fd`, -1: it is gone */
+    struct stream *stream;
+    struct asker *asker;
+    struct can_socket *can;
+    struct tap *tap;              /* NULL: nobody wants what comes */
+    int64_t heard_ns, is_watched; /* is_watched: Python wants to know that frames come */
 };
 
 struct flow {
@@ -58,9 +64,11 @@ struct flow {
     struct source *sources;
 };
 
+SKINWARE_EXPORT void skinware_clock_convert(struct device_clock *clock, const int64_t *stamps, int64_t *times_ns,
+                                            int64_t n);
 bool receive(struct path *path, struct source *source);
 bool receive_line(struct path *path, struct source *source);
-void keep_frames(const struct path *path, const struct source *source, int64_t first, int64_t n);
+void keep_frames(struct tap *tap, const struct batch *batch, int64_t first, int64_t n);
 void keep_bytes(struct tap *tap, const uint8_t *bytes, int64_t n, int64_t time_ns, bool is_sent);
 bool receive_asked(struct path *path, struct source *source);
 int64_t asker_due_ns(const struct asker *asker);

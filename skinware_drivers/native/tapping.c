@@ -1,10 +1,8 @@
 /* Keeps what comes over a wire while somebody wants it: wire_tap.py, and skinware/wire.py for what a piece is. */
 #include "flow.h"
 
-#include <sys/socket.h>
-
 enum { CLASSIC = 1, FD, BYTES, MOST_BYTES = 1 << 14, CLASSIC_PAYLOAD = 8 };
-enum { HEADER = 8, FD_FRAME = 72, LENGTH = 4, FLAGS = 5, IS_FD = 0x04, IS_CUT = 0x80 }; /* of a frame's row */
+enum { HEADER = 8, FD_FRAME = 72, LENGTH = 4, FLAGS = 5, IS_CUT = 0x80 }; /* of a frame's row */
 
 struct piece {
     uint32_t size, count;
@@ -28,14 +26,11 @@ static uint8_t *begin_piece(struct tap *tap, uint8_t form, int64_t count, int64_
 }
 
 /* Rows of the batch as they came, before anything is sorted out. */
-void keep_frames(const struct path *path, const struct source *source, int64_t first, int64_t n)
+void keep_frames(struct tap *tap, const struct batch *batch, int64_t first, int64_t n)
 {
-    const struct batch *batch = path->batch;
-    const struct mmsghdr *headers = (const struct mmsghdr *)(intptr_t)source->headers + first;
     int64_t known = batch->payload_size, size = known == CLASSIC_PAYLOAD ? HEADER + CLASSIC_PAYLOAD : FD_FRAME;
     size_t times = (size_t)n * sizeof *batch->time_ns;
-    uint8_t *at = begin_piece(source->tap, known == CLASSIC_PAYLOAD ? CLASSIC : FD, n, (int64_t)times + n * size,
-                              false);
+    uint8_t *at = begin_piece(tap, known == CLASSIC_PAYLOAD ? CLASSIC : FD, n, (int64_t)times + n * size, false);
     if (!at)
         return;
     memcpy(at, batch->time_ns + first, times);
@@ -43,12 +38,11 @@ void keep_frames(const struct path *path, const struct source *source, int64_t f
     for (int64_t i = 0; i < n; i++, at += size) {
         const uint8_t *row = batch->wire + (first + i) * batch->row_bytes;
         int64_t length = row[LENGTH] < known ? row[LENGTH] : known;
-        bool is_fd = headers[i].msg_len == FD_FRAME || headers[i].msg_hdr.msg_flags & MSG_TRUNC;
         memset(at, 0, (size_t)size); /* behind a short frame there is what was there before */
         memcpy(at, row, (size_t)(HEADER + length));
         memset(at + FLAGS + 1, 0, HEADER - FLAGS - 1);
         at[LENGTH] = (uint8_t)length;
-        at[FLAGS] |= (uint8_t)((is_fd ? IS_FD : 0) | (row[LENGTH] > known ? IS_CUT : 0));
+        at[FLAGS] |= row[LENGTH] > known ? IS_CUT : 0;
     }
 }
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.can import CanAdapter
-from skinware_drivers.can.receiving import is_missing
+from skinware_drivers.can.controller import is_missing
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.fields import Identifier

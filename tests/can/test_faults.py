@@ -24,7 +24,7 @@ import pytest
 from skinware import BusReason, BusState, DriverReader, DriverSnapshot, Status
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware_drivers.bus import ERROR_FLAG, REMOTE_FLAG, FrameBatch
-from skinware_drivers.can.receiving import read_controller
+from skinware_drivers.can.controller import read_controller
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.testing.waiting import wait_until
 from tests.can.conftest import ip

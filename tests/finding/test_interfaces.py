@@ -11,7 +11,7 @@ from typing import NoReturn
 
 import pytest
 
-from skinware_drivers.can.receiving import Controller
+from skinware_drivers.can.controller import Controller
 from skinware_drivers.finding import interfaces
 from skinware_drivers.finding.interfaces import CanInterface, ask_iproute2, can_interfaces, kernel_has_can
 from tests.finding.fakes import add_interface, ip_link

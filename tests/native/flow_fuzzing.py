@@ -350,7 +350,7 @@ class _Fuzz:
             self._generation.update_bus_states()
         elif what == 4 and isinstance(line.bus, SocketCanBus):  # the computer's clock was set
             step_ns = int.from_bytes(self._script.bytes(6), "little", signed=True) >> self._script.number(40)
-            line.bus._stamper.offset_ns += step_ns
+            line.bus._can.offset_ns += step_ns
         else:
             self._generation.path.publish_if_due(self._clock.now_ns)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skinware.status import BusReason
 from skinware_drivers.bus import ERROR_FLAG
-from skinware_drivers.can.receiving import (
+from skinware_drivers.can.controller import (
     TROUBLE_LASTS_S,
     Controller,
     ControllerHealth,

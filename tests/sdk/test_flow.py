@@ -147,6 +147,18 @@ def test_what_is_no_data_frame_is_sorted_out(cable: Cable) -> None:
         assert [s["why"] for s in running.status()["buses"][0]["samples"]] == ["refused"]
 
 
+def test_a_controller_that_goes_off_after_its_last_data_is_off(cable: Cable) -> None:
+    with ExitStack() as boards:
+        boards.enter_context(carried_on(EndOfCable(cable.out), EmulatedRoboskin(EmulatorOptions(boards=BOARDS))))
+        with driving_lines([(RoboskinDriver(RoboskinOptions()), EndOfCable(cable.end))], "roboskin"):
+            with DriverReader("roboskin") as reader:
+                follow(reader, lambda f: not f.status.any())
+                boards.close()
+                cable.put(0x6F3)
+                cable.put(ERROR_FLAG | 0x40)
+                follow(reader, lambda f: f.bus_reason[0] == BusReason.BUS_OFF)
+
+
 def test_strangers_and_wrong_frames_are_counted_and_kept_as_samples(cable: Cable) -> None:
     with flowing(cable) as (running, _), DriverReader("roboskin") as reader:
         follow(reader, lambda f: not f.status.any())

@@ -2,44 +2,30 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import numpy as np
 import numpy.typing as npt
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skinware_drivers import native
-from skinware_drivers.bus import FrameBatch
-from skinware_drivers.can.receiving import Stamper, rows_of
-from skinware_drivers.native import structs
+from tests.sdk.stamping import Stamper
 
 SECOND = 10**9
 WALL_NS = 1_700_000_000 * SECOND
-SLEW_NS = 2_000_000  # as in receiving.c
-
-_stamp = native.library().quick.skinware_stamp
-_stamp.argtypes, _stamp.restype = (ctypes.c_void_p,) * 2 + (ctypes.c_int64,) * 4, None
+SLEW_NS = 2_000_000
 
 
 class Clocks:
-    """CLOCK_MONOTONIC, and a CLOCK_REALTIME that people set; and the stamps of a socket, read by both."""
+    """CLOCK_MONOTONIC, and a CLOCK_REALTIME that people set."""
 
     def __init__(self) -> None:
         self.monotonic_ns = 1000 * SECOND
         self.offset_ns = WALL_NS
-        self._batch = FrameBatch(8)
-        self._rows = rows_of(self._batch)
-        control_at = self._rows.control.ctypes.data
-        self._source = structs.Source(control=control_at, offset_ns=-WALL_NS, last_poll_ns=self.monotonic_ns)
 
-    def read(self, control: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """Return when the frames of this ancillary data arrived."""
-        n = len(control)
-        self._rows.control[:n] = control
-        memory, source = ctypes.byref(self._rows.memory), ctypes.byref(self._source)
-        _stamp(memory, source, 0, n, -self.offset_ns, self.monotonic_ns)
-        return self._batch.time_ns[:n].copy()
+    def stamper(self, has_clock: bool = False) -> Stamper:
+        return Stamper(has_clock, -self.offset_ns, self.monotonic_ns)
+
+    def read(self, stamper: Stamper, arrived: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        return stamper.read(arrived, -self.offset_ns, self.monotonic_ns)
 
 
 def control(clocks: Clocks, times_ns: list[int], hardware_ns: list[int] | None = None) -> npt.NDArray[np.int64]:
@@ -54,13 +40,14 @@ def control(clocks: Clocks, times_ns: list[int], hardware_ns: list[int] | None =
 @given(st.lists(st.tuples(st.integers(-(10**15), 10**15), st.integers(1, 10**8)), min_size=1, max_size=20))
 def test_no_step_moves_a_stamp_out_of_its_poll(steps: list[tuple[int, int]]) -> None:
     clocks = Clocks()
+    stamper = clocks.stamper()
     last_ns = np.int64(clocks.monotonic_ns)
     for step_ns, pause_ns in steps:
         before_ns = clocks.monotonic_ns
         arrived = control(clocks, [before_ns + pause_ns // 3, before_ns + pause_ns // 2])
         clocks.monotonic_ns += pause_ns
         clocks.offset_ns += step_ns
-        read = clocks.read(arrived)
+        read = clocks.read(stamper, arrived)
         window_ns = clocks.monotonic_ns - int(last_ns)  # every time in it is a possible one
         assert (np.diff(np.append(last_ns, read)) >= 0).all()
         last_ns = read[-1]
@@ -71,27 +58,29 @@ def test_no_step_moves_a_stamp_out_of_its_poll(steps: list[tuple[int, int]]) -> 
 
 def test_frames_before_and_after_a_step_in_one_batch() -> None:
     clocks = Clocks()
+    stamper = clocks.stamper()
     start_ns = clocks.monotonic_ns
     early = control(clocks, [start_ns + 1_000_000])
     clocks.offset_ns -= 3600 * SECOND
     late = control(clocks, [start_ns + 2_000_000])
     clocks.monotonic_ns += 5_000_000
-    assert clocks.read(np.concatenate([early, late])).tolist() == [start_ns + 1_000_000, start_ns + 2_000_000]
+    assert clocks.read(stamper, np.concatenate([early, late])).tolist() == [start_ns + 1_000_000, start_ns + 2_000_000]
 
 
 def test_frames_that_came_before_the_kernel_stamped_are_not_later_than_those_after_them() -> None:
     clocks = Clocks()
+    stamper = clocks.stamper()
     start_ns = clocks.monotonic_ns
     when_read = [start_ns + 5_000_000, start_ns + 5_001_000]
     when_arrived = [start_ns + 1_000_000, start_ns + 2_000_000]
     clocks.monotonic_ns += 6_000_000
     expected = [when_arrived[0], when_arrived[0], *when_arrived]
-    assert clocks.read(control(clocks, when_read + when_arrived)).tolist() == expected
+    assert clocks.read(stamper, control(clocks, when_read + when_arrived)).tolist() == expected
 
 
 def test_hardware_stamps_are_on_our_clock_whatever_happens_to_the_wall_clock() -> None:
     clocks = Clocks()
-    stamper = Stamper(hardware=True)
+    stamper = clocks.stamper(has_clock=True)
     generator = np.random.default_rng(11)
     errors = []
     for number in range(1500):
@@ -103,12 +92,13 @@ def test_hardware_stamps_are_on_our_clock_whatever_happens_to_the_wall_clock() -
         clocks.monotonic_ns = max(seen) + 2_000_000
         if number % 100 == 99:
             clocks.offset_ns += 3600 * SECOND if number % 200 == 99 else -3600 * SECOND
-        errors.append(stamper.by_controller(arrived[:, 6] * SECOND + arrived[:, 7], clocks.read(arrived)) - sent)
+        errors.append(clocks.read(stamper, arrived) - sent)
     settled = np.abs(np.concatenate(errors[500:]))
     assert settled.max() < 150_000
 
 
 def test_a_frame_without_any_stamp_is_as_old_as_its_poll() -> None:
     clocks = Clocks()
+    stamper = clocks.stamper(has_clock=True)
     clocks.monotonic_ns += 5_000_000
-    assert clocks.read(np.zeros((2, 8), np.int64)).tolist() == [clocks.monotonic_ns] * 2
+    assert clocks.read(stamper, np.zeros((2, 8), np.int64)).tolist() == [clocks.monotonic_ns] * 2

@@ -75,7 +75,8 @@ def test_rows_of_a_batch_are_kept_without_what_was_there_before(tap: WireTap, pa
     wire = np.zeros(150, wire_dtype(payload_size))
     wire["payload"] = 0xEE
     wire["identifier"], wire["length"] = np.arange(150), np.arange(150) % (payload_size + 3)
-    tap.keep_rows(wire, np.arange(150) + 1000, wire["length"] > 8)
+    wire["flags"][wire["length"] > 8] = IS_FD
+    tap.keep_rows(wire, np.arange(150) + 1000)
     found = frames_of(tap)
     assert [frame[1:3] for frame in found] == [(1000 + number, number) for number in range(150)]
     for number, (_, _, _, flags, payload) in enumerate(found):

@@ -31,13 +31,14 @@ import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 
 from skinware import DriverReader, DriverWriter, Namespace
+from skinware_drivers import native
 from skinware_drivers.bus import FrameBatch
-from skinware_drivers.can.receiving import rows_of
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.description import assemble
 from skinware_drivers.native import structs
+from skinware_drivers.native.compiling import compile_batch
 from skinware_drivers.running.native_path import NativePath
 from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
 from tests.specification.decoding import SpecifiedDecoder
@@ -132,7 +133,7 @@ class Native(Numpy):
         self.flow.rest_until_ns = 0
         self.path._words.must_leave = True
         self.path.run(self.flow)
-        return int(source.frames)
+        return int(self.bus._can.frames)
 
     def close(self) -> None:
         """Take the service back."""
@@ -146,14 +147,13 @@ class Kernel:
     def __init__(self, _namespace: Namespace, sock: socket.socket) -> None:
         self.bus = SocketCanBus("bench")
         self.bus.adopt(sock)
-        self.batch = FrameBatch(2048)
-        self.rows, self.source = rows_of(self.batch), structs.Source()
-        self.bus.hand_over(self.batch, self.source)
+        self.source, self.rows = structs.Source(), compile_batch(FrameBatch(2048), structs.Arrays())
+        self.bus.hand_over(FrameBatch(0), self.source)
 
     def drain(self) -> int:
         """Receive everything that waits; returns the number of frames."""
-        total = 0
-        while (count := self.rows.receive(self.batch, self.source)) > 0:
+        total, receive = 0, native.library().quick.skinware_can_receive
+        while (count := receive(ctypes.byref(self.source), ctypes.byref(self.rows))) > 0:
             total += count
         return total
 

@@ -1,30 +1,19 @@
-"""What goes with the frames of a CAN socket: the memory that C receives them into, their stamps, and the controller.
-
-The controller's rates and state come by rtnetlink, and between two answers by its error frames.
-"""
+"""What the kernel and error frames report about the controller of a CAN interface: rates, state, troubles, stamps."""
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import fcntl
 import socket
 import struct
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
 
-from skinware.realtime import NS_PER_S, now_ns
+from skinware.realtime import NS_PER_S
 from skinware.status import BusReason
-from skinware_drivers import native
-from skinware_drivers.bus import FrameBatch
-from skinware_drivers.native import structs
-from skinware_drivers.native.compiling import compile_batch
-from skinware_drivers.native.device_time import DeviceClock, Times
 
 NO_CAN = "this kernel has no CAN: load it (sudo modprobe can-raw), or use a bus that needs none (--bus virtual)"
 
@@ -193,16 +182,11 @@ class ControllerHealth:
         return next((t for t, until_ns in self._trouble_until_ns.items() if time_ns < until_ns), BusReason.NONE)
 
 
-LONGEST_DELAY_NS = 100_000_000
-"""No frame had its stamp longer before the kernel had the frame."""
-_PART_NS, _JUMP_NS = 250_000_000, 10_000_000  # of the clock of a controller
-
 # asm-generic/socket.h, linux/net_tstamp.h, linux/ethtool.h
 _SO_TIMESTAMPNS, _SO_TIMESTAMPING = 35, 37
 _RX_HARDWARE, _RX_SOFTWARE, _SOFTWARE, _RAW_HARDWARE = 1 << 2, 1 << 3, 1 << 4, 1 << 6
 _SIOCETHTOOL, _ETHTOOL_GET_TS_INFO = 0x8946, 0x41
 _TS_INFO_BYTES = 44
-_HARDWARE_WORD = 6  # of the ancillary data: seconds, then nanoseconds
 
 
 def has_hardware_stamps(sock: socket.socket, interface: str) -> bool:
@@ -218,140 +202,11 @@ def has_hardware_stamps(sock: socket.socket, interface: str) -> bool:
     return bool(flags & _RX_HARDWARE and flags & _RAW_HARDWARE)
 
 
-class Stamper:
-    """The clocks of the stamps of one socket (decision 7).
-
-    Software stamps are CLOCK_REALTIME. C converts them with an offset that is sampled at every poll, so that steps
-    of that clock do no harm: a frame lies between two polls, and only one of the offsets before and after a step puts
-    it there. Hardware stamps are on the controller's clock, which may be set or restarted at any time.
-
-    Attributes:
-        hardware: read the controller's stamps, too.
-        offset_ns: CLOCK_MONOTONIC - CLOCK_REALTIME, ns.
-        last_poll_ns: CLOCK_MONOTONIC ns.
-    """
-
-    def __init__(self, hardware: bool = False) -> None:
-        self.hardware = hardware
-        self._clock = DeviceClock(1e-9, 1 << 62, part_ns=_PART_NS, jump_ns=_JUMP_NS)
-        self.last_poll_ns = now_ns()
-        self.offset_ns = self.last_poll_ns - time.time_ns()
-
-    def switch_on(self, sock: socket.socket) -> None:
-        if self.hardware:
-            flags = _RX_HARDWARE | _RAW_HARDWARE | _RX_SOFTWARE | _SOFTWARE
-            sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)
-        else:
-            # 20 ns a frame cheaper, and stamps also frames from before the kernel began to stamp (in the background)
-            sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-
-    def by_controller(self, hardware: Times, software: Times) -> Times:
-        """Return (n,) int64, CLOCK_MONOTONIC ns: when frames were on the wire.
-
-        Args:
-            hardware: (n,) int64, stamps of the controller, ns, in order; 0: none.
-            software: (n,) int64, stamps of the kernel, CLOCK_MONOTONIC ns; kept where the controller gave none.
-        """
-        stamps, known = software.copy(), np.flatnonzero(hardware)
-        earliest_ns = software[known] - LONGEST_DELAY_NS
-        stamps[known] = np.maximum(self._clock.convert(hardware[known], software[known]), earliest_ns)
-        return stamps
-
-
-CONTROL_WORDS = 8
-"""8-byte words of ancillary data kept for each datagram: a header (2 words), then one ``timespec`` or three."""
-_MMSGHDR = np.dtype(
-    [
-        ("name", np.uint64),
-        ("name_length", np.uint64),
-        ("iov", np.uint64),
-        ("iov_count", np.uint64),
-        ("control", np.uint64),
-        ("control_length", np.uint64),
-        ("flags", np.uint64),
-        ("length", np.uint64),
-    ]
-)
-"""``struct mmsghdr`` of a 64-bit Linux; int members are read and written with their padding."""
-_IOVEC = np.dtype([("base", np.uint64), ("length", np.uint64)])
-
-_receive = native.library().quick.skinware_receive
-_receive.argtypes, _receive.restype = (ctypes.c_void_p,) * 2, ctypes.c_int64
-_wire_bits = native.library().quick.skinware_wire_bits
-_wire_bits.argtypes = (ctypes.c_void_p, ctypes.c_double, ctypes.c_int64, ctypes.c_int64)
-_wire_bits.restype = ctypes.c_double
-_CLASSIC_ROW_BYTES, _FD_FRAME_BYTES = 16, 72
-"""``struct can_frame`` and ``struct canfd_frame``; the kernel always hands out the whole of the latter."""
-
-
-class MessageRows:
-    """The memory of one batch, and the arguments of ``recvmmsg`` for its rows; see ``rows_of``.
-
-    The end of a CAN FD frame that is longer than a row goes into a scratch buffer.
-
-    Attributes:
-        control: (capacity, CONTROL_WORDS) int64, ancillary data of each row. Where the kernel writes none, an earlier
-            frame's data remains (see ``forget``).
-        headers_address: address of the ``mmsghdr`` of the first row.
-    """
-
-    def __init__(self, batch: FrameBatch) -> None:
-        capacity, rows = batch.capacity, np.arange(batch.capacity)
-        self.control: npt.NDArray[np.int64] = np.zeros((capacity, CONTROL_WORDS), np.int64)
-        row_bytes = batch.wire.strides[0]
-        beyond = _FD_FRAME_BYTES - row_bytes if row_bytes > _CLASSIC_ROW_BYTES else 0
-        self._beyond = np.zeros(_FD_FRAME_BYTES, np.uint8)
-        self._iov = np.zeros((capacity, 2), _IOVEC)
-        self._iov["base"][:, 0] = batch.wire.ctypes.data + row_bytes * rows
-        self._iov["length"][:, 0] = row_bytes
-        self._iov["base"][:, 1] = self._beyond.ctypes.data
-        self._iov["length"][:, 1] = max(0, beyond)
-        self._headers = np.zeros(capacity, _MMSGHDR)
-        self._headers["iov"] = self._iov.ctypes.data + self._iov.strides[0] * rows
-        self._headers["iov_count"] = 2 if beyond > 0 else 1
-        self._headers["control"] = self.control.ctypes.data + self.control.strides[0] * rows
-        self._flags, self._length = self._headers["flags"], self._headers["length"]
-        self.headers_address: int = self._headers.ctypes.data
-        self._arrays = structs.Arrays()
-        self.memory = compile_batch(batch, self._arrays)
-
-    def receive(self, batch: FrameBatch, source: structs.Source) -> int:
-        """Fill free rows of the batch from a source; return how many were filled, below 0: errno."""
-        self.memory.stop, self.memory.limit = batch.stop, batch.limit
-        count: int = _receive(ctypes.byref(self.memory), ctypes.byref(source))
-        return count
-
-    def hardware_ns(self, rows: slice) -> Times:
-        """Return (n,) int64, stamps of the controller, ns; 0: none."""
-        stamps: Times = self.control[rows, _HARDWARE_WORD] * NS_PER_S + self.control[rows, _HARDWARE_WORD + 1]
-        return stamps
-
-    def wire_bits(self, first: int, count: int, speed_up: float = 1.0) -> float:
-        """Return about how many bits of the nominal rate frames take; CAN FD frames may switch to a faster one."""
-        bits: float = _wire_bits(ctypes.byref(self.memory), speed_up, first, count)
-        return bits
-
-    def forget(self, rows: slice) -> None:
-        """Clear ancillary data before frames are received that may have none of their own."""
-        self.control[rows] = 0
-
-    def cut(self, rows: slice) -> npt.NDArray[np.bool_]:
-        """Return (n,) bool: the datagrams that were longer than their row: FD frames, though the layout has none."""
-        found: npt.NDArray[np.bool_] = (self._flags[rows] & np.uint64(socket.MSG_TRUNC)) != 0
-        return found
-
-    def are_fd(self, rows: slice) -> npt.NDArray[np.bool_]:
-        """Return (n,) bool: the CAN FD frames, whatever their flags say; valid right after receiving only."""
-        found: npt.NDArray[np.bool_] = (self._length[rows] & np.uint64(0xFFFF_FFFF)) == _FD_FRAME_BYTES
-        return found | self.cut(rows)
-
-
-_rows: WeakKeyDictionary[FrameBatch, MessageRows] = WeakKeyDictionary()
-
-
-def rows_of(batch: FrameBatch) -> MessageRows:
-    """Return the arguments for a batch, made once: all buses that fill the batch share them."""
-    rows = _rows.get(batch)
-    if rows is None:
-        rows = _rows[batch] = MessageRows(batch)
-    return rows
+def stamp_frames(sock: socket.socket, hardware: bool) -> None:
+    """Have the kernel stamp the frames of a socket, and the controller, too, where it can (decision 7)."""
+    if hardware:
+        flags = _RX_HARDWARE | _RAW_HARDWARE | _RX_SOFTWARE | _SOFTWARE
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, flags)
+    else:
+        # 20 ns a frame cheaper, and stamps also frames from before the kernel began to stamp (in the background)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)

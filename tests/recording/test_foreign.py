@@ -395,6 +395,20 @@ def test_bags(tmp_path: Path, kind: str) -> None:
         require(imported(inner)["cloud"], points[:, :, 3], TIMES[:40])
 
 
+def test_topics_beside_those_of_touch_are_no_taxels(tmp_path: Path) -> None:
+    layout = ros.std_msgs__msg__MultiArrayLayout([], 0)
+    rows = np.arange(40, dtype=np.float32).reshape(4, 10)
+    made = [
+        (number, topic, ros.std_msgs__msg__Float32MultiArray(layout, row))
+        for number, row in enumerate(rows)
+        for topic in ("/arm/commands", "/gripper/tactile")
+    ]
+    write_bag(tmp_path / "walk", "mcap", made)
+    require(only(tmp_path / "walk"), rows, TIMES[:4])
+    text = guess(open_source(tmp_path / "walk"))
+    assert text.endswith("# not taken for taxels: the table /arm/commands\n")
+
+
 @pytest.mark.parametrize(
     ("kind", "packing"),
     [("ros1", "BZ2"), ("ros1", "LZ4"), ("sqlite", "FILE"), ("sqlite", "MESSAGE"), ("mcap", "STORAGE")],

@@ -68,6 +68,9 @@ def guess(source: ColumnSource) -> str:
         chosen = [table for table in tables if times[table]]
     else:
         chosen = sorted(tables, key=lambda table: -len(next(iter(tables[table].values()), ())))[:1]
+    by_name = [table for table in chosen if any(_is_named(name) for name in (table, *tables[table]))]
+    others = [table for table in chosen if by_name and table not in by_name]
+    chosen = by_name or chosen
     lines = [
         f"# Guessed from {source.path.name}: check each line, above all units, types and names.",
         f'format = "{FORMAT}"',
@@ -79,8 +82,13 @@ def guess(source: ColumnSource) -> str:
         raise ConfigurationError(f"{source.path}: nothing looks like taxels; {_overview(source, tables)}")
     for each in found:
         lines += each
+    lines += [f"# not taken for taxels: the table {table}" for table in others]
     lines += [f"# left out: {name} ({why})" for name, why in source.left_out.items()]
     return "\n".join(lines) + "\n"
+
+
+def _is_named(name: str) -> bool:
+    return bool(_TOUCH.search(name) or (_TAXELS.search(name) and not _NO_TAXELS.search(name)))
 
 
 def _overview(source: ColumnSource, tables: Mapping[str, Rows]) -> str:

@@ -405,7 +405,8 @@ def test_topics_beside_those_of_touch_are_no_taxels(tmp_path: Path) -> None:
     ]
     write_bag(tmp_path / "walk", "mcap", made)
     require(only(tmp_path / "walk"), rows, TIMES[:4])
-    text = guess(open_source(tmp_path / "walk"))
+    with contextlib.closing(open_source(tmp_path / "walk")) as source:
+        text = guess(source)
     assert text.endswith("# not taken for taxels: the table /arm/commands\n")
 
 

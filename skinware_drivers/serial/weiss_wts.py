@@ -1,8 +1,9 @@
 """Weiss Robotics' WTS tactile sensors, which report how many cells they have, and the protocol of that maker.
 
-Wire format: the programs wts_driver (github.com/ksatyaki/wts_driver) and wts_ft; where they contradict each other (byte
-order of the cells), the former. Frames: ``AA AA AA | command | length u16 LE | payload | CRC u16 LE``, with a CRC over
-everything before it that is in no catalogue. A response has the number of its command and begins with a status, u16 LE.
+Wire format: the programs wts_driver (github.com/ksatyaki/wts_driver) and wts-ft (github.com/CNCR-NTU/wts-ft); where
+they contradict each other (byte order of the cells), the former. Frames: ``AA AA AA | command | length u16 LE | payload
+| CRC u16 LE``, with a CRC over everything before it that is in no catalogue. A response has the number of its command
+and begins with a status, u16 LE.
 Data come as command 0 without a status: time in ms u32 LE, flags u8, cells u16 LE.
 
 Not known: the payload of tare, which is sent empty unless the option ``tare_payload`` gives one; ksatyaki/wts_driver

@@ -33,6 +33,7 @@ def test_the_emulated_sensor_byte_for_byte() -> None:
     assert sensor.answers(MATRIX[:-1] + b"\0") == [message(0x30, b"\x0b\0")]
     assert sensor.answers(message(0x77, b"")) == [message(0x77, b"\x0e\0")]
     assert sensor.answers(message(0x21, b"\0")) == [message(0x21, b"\x0d\0")]
+    assert sensor.answers(message(0x52, b"")) == [message(0x52, b"\0\0emulated")]
     first, *frames = sensor.answers(START_10_MS, 55)
     assert first == message(0x21, b"\0\0")
     assert len(frames) in (5, 6)
@@ -41,6 +42,8 @@ def test_the_emulated_sensor_byte_for_byte() -> None:
         assert frame == message(0x00, stamp + b"\0" + cycle.to_bytes(2, "little") * 2)
     assert sensor.answers(message(0x22, b""))[-1] == message(0x22, b"\0\0")
     assert sensor.answers(b"", 100) == []
+    [single] = sensor.answers(message(0x20, b"\0"))
+    assert single == message(0x20, b"\0\0" + single[8:12] + b"\0" + (cycle + 1).to_bytes(2, "little") * 2)
 
 
 def test_a_sensor_that_streams_already_and_its_operations() -> None:

@@ -14,7 +14,10 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 BEGIN = b"\xaa\xaa\xaa"
-_NEEDED = {0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0}  # bytes of arguments
+_REPORTS = {0x38: b"WTS", 0x50: struct.pack("<BBHI", 1, 1, 0x1000, 4711), 0x52: b"emulated"}
+"""Answers about the kind of sensor, the module (firmware 1.0.0) and its tag."""
+_SINGLE = 0x20
+_NEEDED = {_SINGLE: 1, 0x21: 3, 0x22: 0, 0x23: 0, 0x30: 0, 0x46: 0, **dict.fromkeys(_REPORTS, 0)}  # bytes of arguments
 _OK, _BAD_CHECKSUM, _TOO_SHORT, _UNKNOWN = 0, 11, 13, 14
 
 
@@ -67,6 +70,10 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
         status, answer = self._do(device, command, now_ns)
+        if command[3] == _SINGLE and not status:
+            device.memory["asked"] = True
+            self.burst(device, now_ns)
+            return b""
         return message(command[3], struct.pack("<H", status) + answer)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
@@ -80,7 +87,10 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
             device.memory["zero"] = list(values)
         zero = device.memory.get("zero", [0] * len(values))
         cells = [max(0, value - at_rest) for value, at_rest in zip(values, zero, strict=True)]
-        return [message(0x00, header + struct.pack(f"<{len(cells)}H", *cells))]
+        data = header + struct.pack(f"<{len(cells)}H", *cells)
+        if device.memory.pop("asked", False):
+            return [message(_SINGLE, struct.pack("<H", _OK) + data)]
+        return [message(0x00, data)]
 
     def _do(self, device: Device, command: bytes, now_ns: int) -> tuple[int, bytes]:
         number, arguments = command[3], command[6:-2]
@@ -94,6 +104,8 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
             return _OK, struct.pack("<5H", self.options.columns, self.options.rows, 340, 340, self.full_scale)
         if number == 0x46:
             return _OK, struct.pack("<h", 253)
+        if number in (_SINGLE, *_REPORTS):
+            return _OK, _REPORTS.get(number, b"")
         if number == 0x23:
             device.memory["tare"] = True
         elif number == 0x22:

@@ -63,7 +63,7 @@ HAND = """(() => {
     sheet.module = Array.from({ length: 10 }, (_, i) => i >> 1);
     sheet.shown.totals = a[1];
     const stage = { pixels: 100, width: 2000, camera: { position: { toArray: () => [2, 3, a[2]] } } };
-    stage.project = (x, y, z) => [a[0] * 100 * x + 500, 1500 - a[0] * 100 * y, 1 / a[0]];
+    stage.project = (x, y, z) => [a[0] * 100 * x + (a[3] ?? 500), 1500 - a[0] * 100 * y, 1 / a[0]];
     const found = new m.Names();
     found.arrange([sheet]);
     return found.place(stage);
@@ -83,6 +83,9 @@ def test_parts_of_a_hand_have_names_and_totals_where_there_is_room(tell: Callabl
     assert [name["text"] for name in tell("names.js", HAND, 0.07, None, 9)] == ["right hand"]
     assert tell("names.js", HAND, 0.02, None, 9) == []
     assert tell("names.js", HAND, 1, None, -9) == []  # from behind
+    thumb = ["palm", "right hand", "thumb", "thumb pad", "thumb tip"]
+    assert sorted(name["text"] for name in tell("names.js", HAND, 1, None, 9, -250)) == thumb
+    assert tell("names.js", HAND, 1, None, 9, -500) == []  # beside the picture
 
 
 # -- turn.js -------------------------------------------------------------------------------------------------------

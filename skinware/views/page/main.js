@@ -309,6 +309,7 @@ function dim() {
 
 function choose(row) {
   tree.select(row?.key ?? null);
+  if (row && view.type && !typesOf(skin, row).includes(view.type)) setType(null); // its own
   fillTypes();
   dim();
   if (row) frameAll();

@@ -98,8 +98,10 @@ export class Names {
       const times = isNumbered(part.name) && !part.size ? NUMBERED : 1;
       if (pixels <= FADED * times * widthOf(part.name) || part.isAway(eye)) continue; // most, where there are many
       const seen = CORNERS.map((corner) => stage.project(...corner.map((k, c) => (k ? part.high : part.low)[c])));
-      const middle = seen.reduce((sum, at) => sum + at[0], 0) / 8;
-      const top = Math.max(Math.min(...seen.map((at) => at[1])) - LINE / 2, LINE / 2 + 2);
+      const [xs, ys] = [0, 1].map((c) => seen.map((at) => at[c]));
+      if (isBeside(xs, stage.width) || isBeside(ys, stage.height)) continue;
+      const middle = xs.reduce((sum, x) => sum + x, 0) / 8;
+      const top = Math.max(Math.min(...ys) - LINE / 2, LINE / 2 + 2);
       const alpha = Math.min(1, (pixels / (times * widthOf(part.name)) - FADED) / (WHOLE - FADED));
       const whole = part.load && (part.size || alpha === 1) ? [`${part.name}  ${measure(part.load, part.sheet.unit)}`] : [];
       const lines = part.size ? LINES : [0];
@@ -162,6 +164,7 @@ function partsOf(sheet, areSeveral) {
   return parts;
 }
 
+const isBeside = (places, length) => Math.max(...places) < 0 || Math.min(...places) > length;
 const isNumbered = (name) => /\d$/.test(name);
 
 /** The finger of a pad, "index" of "index tip"; empty where the name counts: "triangle 4" is no part of a "triangle". */

@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
-from skinware.errors import BadServiceFile, ConfigurationError, NamespaceError, Overrun, ServiceNotFound
+from skinware.errors import (
+    BadServiceFile,
+    ConfigurationError,
+    NamespaceError,
+    Overrun,
+    ServiceNotFound,
+    ServiceTimeout,
+    StructureChanged,
+)
 from skinware.memory import futex, segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
@@ -137,13 +145,12 @@ class Drivers(Generic[ReaderT]):
             None if there is no newer one, the service has just restarted, or is not followed any more.
         """
         reader = self.keep_up(name)
-        if reader is None or reader.newest_position is None:
-            return None
-        if newer_than is not None and reader.newest_position == newer_than.position:
+        newest = None if reader is None else reader.newest_position
+        if reader is None or newest is None or (newer_than is not None and newest == newer_than.position):
             return None
         try:
-            return reader.latest()
-        except Overrun:
+            return reader.read(newer_than=newer_than, timeout_s=0.0)
+        except (Overrun, ServiceTimeout, StructureChanged):
             return None
 
     def newest_of_living(self, name: str) -> Any:

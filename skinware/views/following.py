@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.drivers import LOOK_EVERY_NS
 from skinware.errors import NamespaceError
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, now_ns
@@ -27,6 +26,7 @@ from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
 _JUDGE_EVERY_NS = NS_PER_S // 5
+_SERVICES_EVERY_NS = NS_PER_S // 2
 _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _EARLY_NS = 5_000_000
@@ -72,7 +72,7 @@ class Origin:
 
     def look(self) -> list[LiveDriver]:
         if now_ns() >= self._look_ns:
-            self._look_ns = now_ns() + LOOK_EVERY_NS // 2
+            self._look_ns = now_ns() + _SERVICES_EVERY_NS
             for services in self._services:
                 services.look()
         return self.live.look()
@@ -90,9 +90,9 @@ class Origin:
         """Return the newest snapshot of a calmed driver, contacts and motion; None where no living service has one."""
         live = None if self._calm is None else self._calm.get(driver)
         calm = None if live is None or live.frame is None or live.frame.stale else live.frame
-        contacts = [sample for source in self._contacts if (sample := source.of(driver)) is not None]
-        motion = [found for source in self._motion if (found := source.of(driver)) is not None]
-        return calm, next(iter(contacts), None), next(iter(motion), None)
+        contacts = next((sample for source in self._contacts if (sample := source.of(driver)) is not None), None)
+        motion = next((found for source in self._motion if (found := source.of(driver)) is not None), None)
+        return calm, contacts, motion
 
     def contacts_reader(self, driver: str) -> SourceReader[ContactsSample] | None:
         found = (reader for source in self._contacts for reader in source.readers.values())

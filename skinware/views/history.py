@@ -26,7 +26,7 @@ LENGTH_S = 10.0
 _FRAMES = 320
 """Snapshots that are kept at most: ten seconds at 32 a second."""
 _TIMES_THE_NOISE = 6
-_FOLLOW_EVERY_NS = NS_PER_S // 10
+_FOLLOW_EVERY_NS = NS_PER_S // 4
 
 
 def rounded_up(value: float) -> float:
@@ -68,7 +68,7 @@ class DriverRest:
         return self._time_ns is None or not 0 <= time_ns - self._time_ns < self._every_ns
 
     def follow(self, physical: Floats, fresh: npt.NDArray[np.bool_], time_ns: int) -> None:
-        """Take a snapshot into account; the same one again changes nothing. At rest, ten a second are enough.
+        """Take a snapshot into account; the same one again changes nothing. At rest, four a second are enough.
 
         Args:
             physical: (n,) physical values.
@@ -189,10 +189,8 @@ class Memory:
         self._greatest[key] = greatest, time_ns
         return rounded_up(max(greatest, _LEAST_SPAN * noise))
 
-    def limits(self, key: tuple[str, str], values: Floats, known: tuple[float, float]) -> tuple[float, float]:
-        """Return the two limits of values where they are known, otherwise the extremes of (k,) values seen so far."""
-        if all(map(math.isfinite, known)):
-            return known
+    def limits(self, key: tuple[str, str], values: Floats) -> tuple[float, float]:
+        """Return the extremes of (k,) values seen so far."""
         counting = values[np.isfinite(values)]
         low, high = self._extremes.get(key, (math.inf, -math.inf))
         low, high = min(low, float(counting.min(initial=math.inf))), max(high, float(counting.max(initial=-math.inf)))

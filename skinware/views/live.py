@@ -209,11 +209,11 @@ class LiveSources(Drivers[SourceReader[SampleT]], Generic[SampleT]):
 
     def of(self, driver: str) -> SampleT | None:
         """Return the newest sample of the service for a driver; None where no living service has one."""
-        name = next((name for name, reader in self.readers.items() if reader.source.driver == driver), None)
-        if name is None:
-            return None
-        sample: SampleT | None = self.newest_of_living(name)
-        return sample
+        for name, reader in self.readers.items():
+            if reader.source.driver == driver:
+                sample: SampleT | None = self.newest_of_living(name)
+                return sample
+        return None
 
 
 class TouchedPlace(NamedTuple):

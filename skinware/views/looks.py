@@ -189,11 +189,12 @@ class Look:
             return None
         status = newest.status[quantity.where]
         memory = self._memory_of(driver)
-        values, fitting = self._values(newest, quantity, memory, status == 0)
-        scale = fitting if self.mode == "wipe" else self.scale or fitting
         if self.mode == "raw":
-            levels = newest.once((quantity.name, scale), lambda: levels_of(values, status, *scale))
+            scale = self.scale or self._limits(newest, quantity, memory, status)
+            levels = newest.once((quantity.name, scale), lambda: newest.levels(quantity, *scale))
         else:
+            values, fitting = self._distances(newest, quantity, memory, status == 0)
+            scale = fitting if self.mode == "wipe" else self.scale or fitting
             levels = levels_of(values, status, *scale)
         if self.mode == "wipe":  # only sensors that moved further have the highest level, whatever rounding does
             levels[(levels == HIGHEST) & (values <= scale[1])] = HIGHEST - 1
@@ -215,19 +216,25 @@ class Look:
             memory = self._memories[driver.number] = Memory(driver.structure, driver.rest)
         return memory
 
-    def _values(
+    def _limits(
+        self, newest: Newest, quantity: Quantity, memory: Memory, status: npt.NDArray[np.uint8]
+    ) -> tuple[float, float]:
+        """Return the scale that fits values."""
+        name, known = quantity.type.name, (quantity.type.minimum, quantity.type.maximum)
+        is_force = known[0] == 0 and quantity.type.unit.endswith("N")  # few come near the end of their range
+        if all(map(math.isfinite, known)) and not is_force:
+            return known
+        values = newest.physical(quantity)[status == 0]
+        if is_force:
+            span = memory.span((name, self.mode), values, memory.rest.noise(name), newest.frame.published_ns)
+            return 0.0, min(span, known[1])
+        return memory.limits((name, self.mode), values)
+
+    def _distances(
         self, newest: Newest, quantity: Quantity, memory: Memory, fresh: npt.NDArray[np.bool_]
     ) -> tuple[npt.NDArray[np.floating[Any]], tuple[float, float]]:
-        """Return the (n,) values that levels are made of, and the scale that fits."""
+        """Return the (n,) distances that levels are made of, and the scale that fits."""
         name = quantity.type.name
-        if self.mode == "raw":
-            values = newest.physical(quantity)
-            known = (quantity.type.minimum, quantity.type.maximum)
-            if known[0] == 0 and quantity.type.unit.endswith("N"):  # few forces come near the end of their range
-                span = memory.span((name, self.mode), values[fresh], memory.rest.noise(name), newest.frame.published_ns)
-                return values, (0.0, min(span, known[1]))
-            counting = values if np.isfinite(known).all() else values[fresh]
-            return values, memory.limits((name, self.mode), counting, known)
         noise = memory.rest.noise(name)
         if self.mode == "wipe":
             travel = np.zeros(len(quantity), np.float32)

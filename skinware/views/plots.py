@@ -89,6 +89,7 @@ class _Feed:
     def __init__(self, source: _PlotSource) -> None:
         reader = ContactsReader if source.of == "contacts" else DriverReader
         self.reader: ServiceReader[Any] = reader(source.name, namespace=source.namespace, announce=False)
+        self._samples = self.reader.in_order(timeout_s=0.0)
         self.of, self.number = source.of, 0
         self.lines: dict[int, Line] = {}
         self.rows = PlotRows(_MOST_SAMPLES)
@@ -105,11 +106,13 @@ class _Feed:
         """Take the newer samples, and return whether some wait; raise what the reader raises."""
         latest = self.reader.refresh()
         if latest is not None and latest != self.rows.last:
-            with contextlib.suppress(ServiceTimeout, Overrun):
-                for sample in self.reader.in_order(timeout_s=0.0):
+            try:
+                for sample in self._samples:
                     self.rows.add(sample.position, sample.published_ns, self._values(sample))
                     if sample.position >= latest:
                         break
+            except (ServiceTimeout, Overrun):
+                self._samples = self.reader.in_order(timeout_s=0.0)
         return len(self.rows) > 0
 
     def block(self) -> PlotBlock:
@@ -244,15 +247,18 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot]
     starts = np.cumsum([0, *map(len, some)])[:-1]
     quantities = [driver.quantity(line.type) for line in lines]
     highest = np.array([one is not None and one.total == "highest" for one in quantities], bool)[has_sensors]
+    is_each = len(some) == len(at) == len(lines)  # a sensor each
 
     def totals(frame: DriverSnapshot) -> Values:
+        values: Values = frame.values[at] * scale + offset
+        without = frame.status[at] & _NO_VALUE
+        if without.any():
+            values[without != 0] = np.nan
+        if is_each:
+            return values
         found = np.full(len(lines), np.nan)
         if not some:
             return found
-        values: Values = frame.values[at] * scale + offset
-        values[(frame.status[at] & _NO_VALUE) != 0] = np.nan
-        if len(some) == len(at) == len(lines):  # a sensor each
-            return values
         unknown = np.isnan(values)
         values[unknown] = 0
         of_lines = np.where(highest, np.maximum.reduceat(values, starts), np.add.reduceat(values, starts))

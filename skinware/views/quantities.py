@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -225,6 +225,15 @@ def levels_of(values: npt.NDArray[np.floating[Any]], status: npt.NDArray[np.uint
     return levels
 
 
+@lru_cache(32)
+def _levels_by_raw(dtype: np.dtype[Any], scale: float, offset: float, low: float, high: float) -> Levels:
+    """Return the level of each raw value of at most 16 bits; negative ones are counted from the end."""
+    raw = np.arange(1 << 8 * dtype.itemsize).astype(f"u{dtype.itemsize}").view(dtype)
+    values = raw.astype(np.float32) * np.float32(scale) + np.float32(offset)
+    with np.errstate(over="ignore"):  # far beyond both limits
+        return levels_of(values, np.zeros(len(raw), np.uint8), low, high)
+
+
 def shear_of(vectors: npt.NDArray[np.floating[Any]], longest: float) -> npt.NDArray[np.int8]:
     """Return (n, 2) int8: vectors as parts of ``longest``, which is 127; 0 where a vector is not known."""
     scaled = np.nan_to_num(vectors * np.float32(_LONGEST / longest if longest > 0 else 0.0), posinf=0.0, neginf=0.0)
@@ -260,6 +269,16 @@ class Newest:
     def physical(self, quantity: Quantity) -> npt.NDArray[np.floating[Any]]:
         """Return (n,) values of a quantity's sensors in its unit."""
         return self.once(("physical", quantity.name), lambda: self.frame.physical(quantity.type.name))
+
+    def levels(self, quantity: Quantity, low: float, high: float) -> Levels:
+        """Return (n,) uint8, the values of a quantity's sensors as :func:`levels_of` returns them."""
+        status, raw = self.status[quantity.where], self.frame.values[quantity.where]
+        if raw.dtype.kind == "f" or raw.dtype.itemsize > 2:
+            return levels_of(self.physical(quantity), status, low, high)
+        levels: Levels = _levels_by_raw(raw.dtype, quantity.type.scale, quantity.type.offset, low, high)[raw]
+        if status.any():
+            levels[(status & np.uint8(WITHOUT_VALUE)) != 0] = NO_VALUE
+        return levels
 
     def all_physical(self) -> npt.NDArray[np.float32]:
         """Return (n_sensors,) float32, values of the sensors of all types, each in its unit."""

@@ -30,7 +30,7 @@ from skinware.views.tree import problem_of_all, problems_of, state_of, worst_fir
 PROTOCOL = "skinware.view.2"
 _ALIGNMENT = 8
 _STATE_EVERY_NS = NS_PER_S
-_EXACT_EVERY_NS = NS_PER_S // 10
+_EXACT_EVERY_NS = NS_PER_S // 5
 """People read no more numbers."""
 _MOST_QUESTIONS = 64
 
@@ -59,7 +59,7 @@ class _Got:
 
     def __init__(self) -> None:
         self.change: tuple[int, int] | None = None
-        self.status: dict[str, npt.NDArray[np.uint8]] = {}
+        self.status: dict[str, bytes] = {}
         self.contacts: tuple[tuple[object, ...], list[dict[str, Any]]] = (), []
 
 
@@ -235,9 +235,8 @@ class Viewer:
             if len(picture.totals) > 1:
                 shown["between"] = blobs.add(picture.totals[:-1], "<f4")
         status, got = newest.marked[quantity.where], self._got[driver.number]
-        before = got.status.get(quantity.name)
-        if before is None or not np.array_equal(status, before):
-            got.status[quantity.name] = status
+        if got.status.get(quantity.name) != (in_bytes := status.tobytes()):
+            got.status[quantity.name] = in_bytes
             shown["status"] = blobs.add(status, "u1")
         return shown
 

@@ -14,6 +14,7 @@ from skinware.realtime import now_ns
 from skinware.sensor_types import FORCE
 from skinware.tactile.contacts_service import ContactsWriter
 from skinware.views import history
+from skinware.views.quantities import levels_of
 from skinware.views.robot import Robot
 from skinware.views.turns import PROTOCOL
 from skinware_drivers.testing.waiting import wait_until
@@ -75,6 +76,20 @@ def test_raw_levels_are_the_values(serving: Serve) -> None:
         picture = page.pull_picture(condition=lambda picture: picture["type"] == "temperature")
         values = skin.values[skin.structure.index("temperature")] * 0.5
         assert np.abs(picture["levels"] - np.clip(np.round(values * 2.5), 0, 250)).max() <= 1
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "i2", "i4", "f4"])
+def test_levels_are_those_of_physical_values(serving: Serve, dtype: str) -> None:
+    skin = FakeSkin("torso", fake_structure(dtype=dtype))
+    skin.values = np.arange(768) % 100 - (0 if dtype.startswith("u") else 50)
+    skin.status[::7] = Status.NOT_CONNECTED
+    where = skin.structure.index("temperature")
+    with publishing(skin), serving() as url, page_of(url) as page:
+        page.say("look", type="temperature", scale=[-11, 17])
+        levels = page.pull_picture(condition=lambda picture: picture["type"] == "temperature")["levels"]
+        physical = skin.structure.physical(skin.values.astype(dtype), "temperature")
+        assert np.array_equal(levels, levels_of(physical, skin.status[where], -11, 17))
+        assert len(set(levels.tolist())) > 10
 
 
 def test_status_is_sent_when_it_changes(serving: Serve) -> None:

@@ -19,14 +19,17 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from contextlib import ExitStack
+from collections import deque
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from skinware import Namespace
+from skinware.errors import Closed
 from skinware.service import ServiceReader
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,6 +38,16 @@ PRIORITY = 40
 """Priority of the driver; that of the emulator is one less, that of each program behind the driver one more."""
 SETTLED_S = 8.0
 LIMIT_MS = 12
+KEPT = 4096
+"""Samples of the driver that are kept, to look at those of a contact behind it."""
+SLOWEST = 5
+STAGES = (
+    "contact to its first frame",
+    "to the frame of the onset",
+    "until it is published",
+    "to the reader",
+    "to the stop",
+)
 BINDING = """
 format = "skinware-binding"
 version = 1
@@ -45,7 +58,28 @@ module = [
     {device = 0, first = 3, body = "right_finger", rows = 1, reach_m = 0.03, x = [0, 1, 0], y = [0, 0, -1]},
 ]
 """
-Stages = dict[str, list[float]]
+
+
+class Closing(NamedTuple):
+    """What a closing took.
+
+    Attributes:
+        stages_ms: (stages,) durations.
+        counts: of both fingertips above their rest, in each frame from the contact to that of the onset.
+        pressed_n: force half a second later.
+    """
+
+    stages_ms: list[float]
+    counts: list[list[int]]
+    pressed_n: float
+
+
+class Kept(NamedTuple):
+    """A sample of the driver: its times, and the counts of both fingertips."""
+
+    acquired_ns: int
+    published_ns: int
+    counts: Any
 
 
 def commands(bus: str, period_ms: int, folder: Path, calm: str) -> list[tuple[str, ...]]:
@@ -55,7 +89,7 @@ def commands(bus: str, period_ms: int, folder: Path, calm: str) -> list[tuple[st
     world = f"mujoco:{folder / 'gripper.toml'}"
     profile = ("--realtime", f"fifo:{PRIORITY}") if os.geteuid() == 0 else ()
     driver: tuple[str, ...] = ("skin-driver", "--driver", "allegro_v5", "--model", "tips", "--latency", "0")
-    driver += "--period-ms", str(period_ms), *profile
+    driver += "--period-ms", str(period_ms), "--slots", "64", *profile
     rest = [
         ("skin-calm", "allegro_v5", "--into", calm),
         (sys.executable, str(ROOT / "examples" / "reflex.py"), calm, "joints"),
@@ -66,10 +100,9 @@ def commands(bus: str, period_ms: int, folder: Path, calm: str) -> list[tuple[st
     return [("skin-emulate", *options, "--json"), (*driver, "--bus", bus), *rest]
 
 
-def run(started: list[tuple[str, ...]], closings: int, seed: int, folder: Path) -> tuple[Stages, list[float], int]:
-    """Close the gripper again and again; return the stages, ms, the forces 0.5 s later, N, and the misses."""
-    random, pressed_n, missed = np.random.default_rng(seed), [], 0
-    late: Stages = {name: [] for name in ("contact to frame", "frame to command", "command to stop", "all")}
+def run(started: list[tuple[str, ...]], closings: int, seed: int, folder: Path) -> tuple[list[Closing], int]:
+    """Close the gripper again and again; return what was stopped, and how many were not."""
+    random, found, missed = np.random.default_rng(seed), [], 0
     pids: list[int] = []
     events = folder / f"log{len(started) - 1}"
     with ExitStack() as stack:
@@ -83,6 +116,9 @@ def run(started: list[tuple[str, ...]], closings: int, seed: int, folder: Path) 
             time.sleep(2)
         truth = stack.enter_context(ServiceReader("truth", timeout_s=60))
         joints = stack.enter_context(ServiceReader("joints", timeout_s=60))
+        kept: deque[Kept] = deque(maxlen=KEPT)
+        frames = stack.enter_context(ServiceReader("allegro_v5", timeout_s=60))
+        threading.Thread(target=keep, args=(frames, kept), daemon=True).start()
         joints.call("move", targets={"lift": -0.065, "close": 0.0}, seconds=1.0, timeout_s=30)
         time.sleep(SETTLED_S)
         used_s, from_s = [cpu_s(pid) for pid in pids], time.monotonic()
@@ -99,21 +135,54 @@ def run(started: list[tuple[str, ...]], closings: int, seed: int, folder: Path) 
             contact_ns = begin_ns + round(1e9 * float(sample.column("touched_s")[0]))
             lines = events.read_text().splitlines()[seen:]
             begun = [re.findall(r"\d+", line) for line in lines if line.startswith(("onset", "confirmed"))]
-            if not begun:
+            if begun:
+                _, read_us, done_us, frame_ns = map(int, begun[0])
+                pressed_n = float(sample.column("force_n")[0])
+                one = closing(list(kept), contact_ns, frame_ns, (read_us, done_us), pressed_n)
+                found += [] if one is None else [one]
+            else:
                 missed += 1
-                continue
-            _, sent_us, done_us, frame_ns = map(int, begun[0])
-            frame_ms = (frame_ns - contact_ns) / 1e6
-            stages_ms = frame_ms, sent_us / 1e3, (done_us - sent_us) / 1e3, frame_ms + done_us / 1e3
-            for of_stage, stage_ms in zip(late.values(), stages_ms, strict=True):
-                of_stage.append(stage_ms)
-            pressed_n.append(float(sample.column("force_n")[0]))
         shares = [(cpu_s(pid) - before) / (time.monotonic() - from_s) for pid, before in zip(pids, used_s, strict=True)]
         print(f"shares of a processor, in the order of frames: {', '.join(f'{share:.2f}' for share in shares)}")
         if missed:
             ends = [(folder / f"log{number}").read_text()[-600:] for number in range(len(started))]
             print("\n".join(ends), file=sys.stderr)
-    return late, pressed_n, missed
+    return found, missed
+
+
+def keep(frames: ServiceReader[Any], kept: deque[Kept]) -> None:
+    """Keep the newest samples of the driver."""
+    with suppress(Closed):
+        for sample in frames.in_order():
+            kept.append(Kept(sample.acquired_ns, sample.published_ns, sample.column("values")[::3].astype(int)[:2]))
+
+
+def closing(
+    kept: list[Kept], contact_ns: int, frame_ns: int, ages_us: tuple[int, int], pressed_n: float
+) -> Closing | None:
+    """Return the stages of a closing; None without the driver's sample of its onset."""
+    rest = [one for one in kept if one.acquired_ns < contact_ns]
+    between = [one for one in kept if contact_ns <= one.acquired_ns <= frame_ns]
+    if not rest or not between or between[-1].acquired_ns != frame_ns:
+        return None
+    published_ns = between[-1].published_ns
+    times_ns = [contact_ns, between[0].acquired_ns, frame_ns, published_ns, *(frame_ns + 1000 * us for us in ages_us)]
+    above = [(one.counts - rest[-1].counts).tolist() for one in between]
+    return Closing((np.diff(times_ns) / 1e6).tolist(), above, pressed_n)
+
+
+def table(found: list[Closing]) -> str:
+    """Return the durations of all stages, and those of the slowest closings."""
+    stages_ms = np.array([[*one.stages_ms, sum(one.stages_ms)] for one in found])
+    lines = ["| ms | p50 | p99 | most |", "|---|---|---|---|"]
+    for name, of_stage in zip((*STAGES, "all"), stages_ms.T, strict=True):
+        lines.append(f"| {name} | {' | '.join(f'{one:.1f}' for one in np.percentile(of_stage, [50, 99, 100]))} |")
+    lines.append("\nthe slowest, stage by stage, and counts of both fingertips from frame to frame:")
+    lines += [
+        f"{' + '.join(f'{one:.1f}' for one in found[row].stages_ms)} ms: {found[row].counts}"
+        for row in np.argsort(-stages_ms[:, -1])[:SLOWEST]
+    ]
+    return "\n".join(lines)
 
 
 def cpu_s(pid: int) -> float:
@@ -168,17 +237,17 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
             started = commands(bus, arguments.period_ms, folder, calm.name)
-            late, pressed_n, missed = run(started, arguments.closings, arguments.seed, folder)
+            found, missed = run(started, arguments.closings, arguments.seed, folder)
     finally:
         for namespace in (source, calm):
             shutil.rmtree(namespace.path, ignore_errors=True)
-    if pressed_n:
-        print(f"\n{arguments.period_ms} ms a frame on {bus}, ms:\n\n| | p50 | p99 | most |\n|---|---|---|---|")
-        for name, of_stage in late.items():
-            print(f"| {name} | {' | '.join(f'{one:.1f}' for one in np.percentile(of_stage, [50, 99, 100]))} |")
-        verdict = "holds" if missed == 0 and np.percentile(late["all"], 99) <= LIMIT_MS else "MISSED"
-        print(f"\np99 of {LIMIT_MS} ms: {verdict}; it then presses {np.median(pressed_n):.2f} N")
-    print(f"{len(pressed_n)} closings stopped, {missed} not")
+    if found:
+        print(f"\n{arguments.period_ms} ms a frame on {bus}:\n\n{table(found)}")
+        holds = missed == 0 and np.percentile([sum(one.stages_ms) for one in found], 99) <= LIMIT_MS
+        pressed_n = np.median([one.pressed_n for one in found])
+        print(f"\np99 of {LIMIT_MS} ms: {'holds' if holds else 'MISSED'}; it then presses {pressed_n:.2f} N")
+    unknown = arguments.closings - len(found) - missed
+    print(f"{len(found)} closings stopped, {missed} not; of {unknown} this program has missed a sample")
 
 
 if __name__ == "__main__":

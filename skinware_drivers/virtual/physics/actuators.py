@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 import mujoco
+import numpy as np
+import numpy.typing as npt
 
 from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.physics.binding import Bound
@@ -56,23 +58,31 @@ class Actuators:
         """Stop every movement: the actuators keep the targets that they have."""
         self._ramps.clear()
 
-    def advance(self) -> None:
+    def course(self, steps: int, step_s: float) -> npt.NDArray[np.float64]:
+        """Return (n, actuators) the targets of the next steps, at most ``steps``: up to the next move of the scene."""
+        self._begin_moves()
+        times_s = np.full(steps, step_s)
+        times_s[0] = self._data.time
+        times_s = np.cumsum(times_s)
         if self._next_move < len(self._moves):
-            self._begin_moves()
-        if not self._ramps:
-            return
-        now_s, ctrl = self._data.time, self._data.ctrl
-        for actuator, (begin_s, end_s, start, target) in list(self._ramps.items()):
-            share = 1.0 if now_s >= end_s else (now_s - begin_s) / (end_s - begin_s)
-            ctrl[actuator] = start + share * (target - start)
-            if share == 1.0:
-                del self._ramps[actuator]
+            times_s = times_s[: max(1, int(np.searchsorted(times_s + _EPSILON_S, self._due_s())))]
+        targets = np.repeat(self._data.ctrl[np.newaxis], len(times_s), axis=0)
+        if self._ramps:
+            moving = list(self._ramps)
+            begin_s, end_s, start, target = np.array(list(self._ramps.values())).T
+            passed = (times_s[:, np.newaxis] - begin_s) / np.maximum(end_s - begin_s, _EPSILON_S)
+            share = np.where(times_s[:, np.newaxis] >= end_s, 1.0, passed)
+            targets[:, moving] = start + share * (target - start)
+            for row in np.flatnonzero(times_s[-1] >= end_s).tolist():
+                del self._ramps[moving[row]]
+        return targets
+
+    def _due_s(self) -> float:
+        return self._moves[self._next_move].at_s + self._round * (self._repeat_s or 0.0)
 
     def _begin_moves(self) -> None:
-        while self._next_move < len(self._moves):
+        while self._next_move < len(self._moves) and self._data.time + _EPSILON_S >= self._due_s():
             move = self._moves[self._next_move]
-            if self._data.time + _EPSILON_S < move.at_s + self._round * (self._repeat_s or 0.0):
-                return
             self.move(self.poses[move.pose], move.seconds)
             self._next_move += 1
             if self._next_move == len(self._moves) and self._repeat_s is not None:

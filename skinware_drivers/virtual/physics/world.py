@@ -32,6 +32,7 @@ class WorldServices:
 
     def __init__(self, scene: PhysicsScene) -> None:
         self._scene = scene
+        scene.notes_touch = True
         self._due_ns = 0
         n, joints, actuators = len(scene.modules), len(scene.joints), len(scene.actuators.names)
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from skinware.native import read_structs
 
-_HEADERS = ("path.h", "inside.h", "framing.h", "flow.h")
+_HEADERS = ("path.h", "inside.h", "framing.h", "flow.h", "touching.h")
 _OF_C_ALONE = ("path", "chain")
 """Structs with fields of other sizes, which Python never sees."""
 

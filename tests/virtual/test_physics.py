@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,10 +16,11 @@ from skinware.errors import ConfigurationError, MissingExtra
 from skinware.geometry import GeometryGroup, geometry_to_toml, read_geometry
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.physics.binding import find_binding
-from skinware_drivers.virtual.physics.body import PhysicsScene, Touching, distances, spread
+from skinware_drivers.virtual.physics.body import PhysicsScene
 from skinware_drivers.virtual.physics.taxels import places_in
 from skinware_drivers.virtual.physics.transfer import Transfer, TransferSettings
 from skinware_drivers.virtual.physics.world import PhysicsWorld
+from tests.specification import touching as specified
 
 from .rig import MS, START_NS
 from .scenes import PAD, hardware_in, on_the_pad
@@ -123,13 +125,39 @@ def test_the_centre_of_pressure_is_that_of_the_contact(tmp_path: Path, seed: int
 
 
 def test_a_contact_between_taxels_is_shared_by_the_nearest(tmp_path: Path) -> None:
-    [module] = pad(tmp_path).modules
-    point_m, normal = np.zeros(3), np.array([0.0, 0.0, 1.0])
-    [distance_m] = distances(module, point_m[np.newaxis], normal[np.newaxis])
-    touch = Touching(0, point_m, normal, 2.0, np.array([0.5, 0.0, 0.0]), 0.0, distance_m)
-    forces = spread(module, np.zeros(16), [touch])
+    """A ball with a soft skin touches before any taxel is inside of it."""
+    scene = pad(tmp_path)
+    scene.model.geom_margin[:] = 0.002
+    scene.model.geom_gap[:] = 0
+    pressed(scene, 0.2)
+    [touch], [forces] = scene.touching(), scene.newtons()
+    assert not scene.raw(0)[0].any()
     assert np.count_nonzero(forces[:, 2]) == 4
-    assert forces.sum(axis=0) == pytest.approx([0.5, 0.0, 2.0])
+    assert forces.sum(axis=0) == pytest.approx([*touch.shear_n[:2], touch.normal_n])
+
+
+@pytest.mark.parametrize(
+    ("world", "driver", "at_s"),
+    [("pad", "xela", (2.6, 4.5)), ("gripper", "robotiq_tsf", (3.6, 6.4)), ("hand", "inspire", (7.0, 9.0, 10.0))],
+)
+def test_touches_and_their_forces_are_as_specified(world: str, driver: str, at_s: tuple[float, ...]) -> None:
+    scene = PhysicsScene(find_binding(f"mujoco:{world}", driver))
+    for time_s in at_s:
+        scene.step_to(time_s)
+        found, wanted = scene.touching(), specified.touches(scene)
+        assert found
+        for one, other in zip(found, wanted, strict=True):
+            numbers, expected = (np.hstack(list[Any](touch)) for touch in (one, other))
+            np.testing.assert_allclose(numbers, expected, rtol=1e-9, atol=1e-12)
+        for forces, expected_n in zip(scene.newtons(), specified.newtons(scene), strict=True):
+            np.testing.assert_allclose(forces, expected_n, rtol=1e-9, atol=1e-12)
+
+
+def test_there_is_room_for_any_number_of_contacts(tmp_path: Path) -> None:
+    scene = pressed(pad(tmp_path), 3.0)
+    scene._contacts._make_room(0)
+    scene.settle()
+    assert len(scene.touching()) == scene.data.ncon == 1
 
 
 def test_what_no_taxel_is_near_is_not_felt(tmp_path: Path) -> None:

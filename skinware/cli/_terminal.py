@@ -23,7 +23,7 @@ from typing import Any, TextIO
 import click
 import msgspec
 
-from skinware.text import printable
+from skinware.text import plural, printable
 
 _MOST_WAITING = 1 << 20
 """Bytes that may wait to be read; later text is left out."""
@@ -153,7 +153,7 @@ def patient_output() -> Iterator[None]:
         if out is not None:
             if err is not None and out.left_out:
                 with contextlib.suppress(OSError):
-                    err.write(f"{out.left_out} lines of output were left out: they were not read\n")
+                    err.write(f"{plural(out.left_out, 'line')} of output left out: no program read them\n")
             out.end()
         if err is not None:
             err.end()

@@ -21,6 +21,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import are_terminals, echo, print_json
+from skinware.text import plural
 
 if TYPE_CHECKING:
     from skinware.recording.files import Target
@@ -249,7 +250,7 @@ class _Progress:
         for name, count in messages.items():
             echo(f"{name}: {count} messages")
         count = self._recorder.missed
-        missed = f", {count} samples missed" if count else ", nothing missed" * is_complete
+        missed = f", {plural(count, 'sample')} missed" if count else ", nothing missed" * is_complete
         ended = "complete" if is_complete else "ended early"
         echo(f"{', '.join(files) or 'no file'}: {ended}, {self._target.size / 1e6:.1f} MB{missed}")
 

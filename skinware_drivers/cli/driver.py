@@ -267,7 +267,7 @@ def print_capture(capture: Capture, as_json: bool) -> None:
         elif capture.result["problem"]:
             echo(f"{capture.path}: ended early: {capture.result['problem']}", err=True)
         else:
-            missed = f", {capture.result['missed']} samples missed" if capture.result["missed"] else ""
+            missed = f", {plural(capture.result['missed'], 'sample')} missed" if capture.result["missed"] else ""
             size = capture.result["bytes"] / 1e6
             echo(f"{capture.path}: {size:.1f} MB{missed}; skin-driver --bus replay:{capture.path} decodes it again")
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from skinware.errors import BusError, BusNotAvailable, BusSendError, ConfigurationError, HandshakeTimeout
-from skinware.text import nearest_name
+from skinware.text import nearest_name, plural
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus, FrameBatch
 from skinware_drivers.description import Patch
@@ -108,8 +108,8 @@ async def carry_out(
         is_live = traffic.frames > 0
         if is_live and not wanted.looks and not force:
             raise ConfigurationError(
-                f"{bus_name}: {traffic.frames} frames were heard in {_LISTEN_S:g} s, so another program may be using"
-                " the bus: end it, or say --force"
+                f"{bus_name}: {plural(traffic.frames, 'frame')} heard in {_LISTEN_S:g} s, so another program may be"
+                " using the bus: end it, or say --force"
             )
         if is_live and not force:
             patches: Sequence[Patch] = await patches_heard(traffic, bus, adapter) if patch_name else ()

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.status import LOAD_FILTERED, LOAD_UNKNOWN, BusReason
 from skinware.structure import Structure
+from skinware.text import plural
 from skinware_drivers.bus import Bus
 
 log: logging.Logger = logging.getLogger("skinware.driver")
@@ -87,7 +88,7 @@ class BusNews:
         """Log the pending change if the limit allows it; to be called regularly."""
         if not self._pending or not self._limit.take():
             return
-        before = f" ({self._left_out} changes before this one were not logged)" if self._left_out else ""
+        before = f" ({plural(self._left_out, 'earlier change')} not logged)" if self._left_out else ""
         log.warning("%s%s", self._pending, before)
         self._pending, self._left_out = "", 0
 
@@ -262,7 +263,9 @@ class BusLimits:
             self._log_once("fill", f"the receive buffer was {fill:.0%} full: this driver gets too little time")
         if bus.counters.dropped > self._dropped:
             dropped = bus.counters.dropped - self._dropped
-            self._log_once("dropped", f"{dropped} frames dropped: the receive buffer was full (or the adapter's queue)")
+            self._log_once(
+                "dropped", f"{plural(dropped, 'frame')} dropped: the receive buffer was full (or the adapter's queue)"
+            )
 
     @property
     def is_full(self) -> bool:

@@ -1,8 +1,9 @@
 """The tactile glove of Bielefeld University (TactileGlove, iObject), as its first firmware speaks on a serial line.
 
-Wire format: the maker's host (tactile-filters, ``linux/libio/SerialInput.cpp``). 115200 baud. One packet of five bytes
-for each taxel: ``3C + taxel``, 01, high byte, low byte, 00. The value has twelve bits, the lower four bits of the high
-byte first; the meaning of the upper four is unknown. The maker's host shows 4095 - value: pressure lowers the value.
+Wire format: the maker's firmware and host (ubi-agni/TactileGlove 59a0ef6, 2025-04-25, ``firmware/PIC18`` and
+``linux/libio/SerialInput.cpp``). 115200 baud. One packet of five bytes for each taxel: ``3C + taxel``, 01, high byte,
+low byte, 00. The value has twelve bits, the lower four bits of the high byte first; the upper four are the channel of
+the converter. The maker's host shows 4095 - value: pressure lowers the value.
 
 A packet has no checksum and no counter, and the glove takes no command. A packet counts if its first, second and last
 byte are right, and a packet follows: one that lost bytes could otherwise pass with the beginning of the next.

@@ -8,8 +8,9 @@ All numbers are little-endian; LRC is minus the sum of all bytes before it.
 * Stream: ``AA 56 | 00 | bytes u16 | error u8 | data | LRC``; the bytes count error and data. Data: for each connected
   slot, in order, the resultant (three u16, whose low byte counts) and its taxels; nine taxels at most for a module on
   the palm. The length of a frame follows from the slots and their numbers of taxels, which must be read first.
-* Registers: 0000 version, 15 characters; 0010 to 0013 connected slots, one bit each, the lowest first; 0017 stream on
-  and off; 0030 and 0066 numbers of taxels, u16, of the slots of the fingers and of the palm.
+* Registers: 0000 version, 15 characters; 0010 to 0013 connected slots, one bit each, the lowest first; 0016 kinds of
+  data (1 resultants, 2 taxels); 0017 stream on and off; 0030 numbers of taxels, u16, of the slots; those of the palm
+  are at 0066 in the maker's Hand_UI.py, behind the others in its text and in paxini-sdk 0.1.0: both are tried.
 
 A program that ends without switching the stream off leaves the board sending. So the driver switches the stream off
 before its first question, drops the bytes received, and repeats questions that are not answered.
@@ -49,7 +50,7 @@ STRANGE = 0x57
 _REPLY, _STREAM = 0x55, 0x56
 _READ, _WRITE, _CALIBRATE, _IS_ERROR = 0x03, 0x10, 0x17, 0x80
 _VERSION, _CONNECTED, _SWITCH, _CALIBRATION = 0x0000, 0x0010, 0x0017, 0x0002
-_POINTS_ON_FINGERS, _POINTS_ON_PALM = 0x0030, 0x0066
+_KINDS, _BOTH, _POINTS, _POINTS_ON_PALM = 0x0016, 0x03, 0x0030, 0x0066
 _FINGER_SLOTS, _SLOTS, _BYTES_OF_MASK = 20, 28, 4
 _MOST_ON_PALM = 9
 _LENGTH_AND_ERROR, _RESULTANT, _RESULTANT_STEP = 3, 6, 2
@@ -129,6 +130,9 @@ class HighSpeedBoard:
         await self.stop(link)
         self.use(self.framing)
         version = (await self._read(link, _VERSION, VERSION_BYTES)).rstrip(b"\0 ").decode("ascii", "replace")
+        kinds = (await self._read(link, _KINDS, 1))[0] & _BOTH
+        if kinds in (1, 2):
+            raise BusError(f"the board {version} streams resultants or taxels alone: write 3 into its register 0016")
         slots = await self._ask_slots(link)
         if not slots:
             raise BusError(f"the board {version} says that no module is connected to it")
@@ -207,14 +211,21 @@ class HighSpeedBoard:
         connected = int.from_bytes(mask, "little")
         slots = []
         for number in (number for number in range(_SLOTS) if connected >> number & 1):
-            is_on_finger = number < _FINGER_SLOTS
-            first = _POINTS_ON_FINGERS if is_on_finger else _POINTS_ON_PALM - 2 * _FINGER_SLOTS
-            points = int.from_bytes(await self._read(link, first + 2 * number, 2, tries), "little")
-            slot = Slot(number, points if is_on_finger else min(points, _MOST_ON_PALM))
+            points = await self._ask_points(link, number, tries)
+            slot = Slot(number, points if number < _FINGER_SLOTS else min(points, _MOST_ON_PALM))
             if points > MOST_POINTS:
                 raise BusError(f"the board says that {slot.name} has {points} taxels: that cannot be")
             slots.append(slot)
         return slots
+
+    async def _ask_points(self, link: Link, number: int, tries: int) -> int:
+        """Ask for the number of taxels in a slot; on the palm at both registers."""
+        if number >= _FINGER_SLOTS:
+            with contextlib.suppress(Refused):
+                at = _POINTS_ON_PALM + 2 * (number - _FINGER_SLOTS)
+                if points := int.from_bytes(await self._read(link, at, 2, tries), "little"):
+                    return points
+        return int.from_bytes(await self._read(link, _POINTS + 2 * number, 2, tries), "little")
 
     async def _switch(self, link: Link, *, on: bool) -> bool:
         """Switch the stream on or off; return whether a reply or an empty streamed frame acknowledged it."""

@@ -165,7 +165,7 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
                 memory[0x10 + slot // 8] |= 1 << slot % 8
                 at = 0x30 + 2 * slot if slot < 20 else 0x66 + 2 * (slot - 20)
                 memory[at : at + 2] = self.options.points.to_bytes(2, "little")
-            memory[0x17] = device.streams_from_ns is not None
+            memory[0x16:0x18] = 3, device.streams_from_ns is not None  # resultants and taxels
             read = bytes(memory[register : register + count])
             return message(b"\xaa\x55\0", command[3:8], read.ljust(count, b"\0"))
         if function == 0x10 and register == 0x17:

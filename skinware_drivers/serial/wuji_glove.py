@@ -27,7 +27,7 @@ from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import CRC16_CCITT_FALSE, Answers, Field, Length, Packet, SerialAdapter
 
 _INFO, _HAND, _DIAGNOSTICS, _STREAM, _GET, _SET = 0x0101, 0x0103, 0x0301, 0x0401, 0x0501, 0x0502
-_RATE, _U16 = 2, 0  # key and type of the configuration value
+_STREAMING, _RATE, _U16 = 1, 2, 0  # keys of configuration values, and the type of the rate
 _DATA, _ANSWER = 0x55, 0x57
 _ROWS, _COLUMNS = 24, 32
 _N = _ROWS * _COLUMNS
@@ -81,6 +81,7 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
         self._wanted_hz = options.rate_hz
         self.period_s = 1 / (options.rate_hz or _USUAL_HZ)
         self._on = True
+        self._was_on: bool | None = None
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the board which hand it is for; a listener does without."""
@@ -106,10 +107,13 @@ class WujiGloveDriver(SerialAdapter[WujiGloveOptions]):
             await self._set_rate(link, self._wanted_hz)
 
     async def start(self, link: Link) -> None:
+        if self._was_on is None:
+            self._was_on = (await self._ask(link, _GET, struct.pack("<H", _STREAMING), size=2))[1] != 0
         await self._ask(link, _STREAM, bytes([self._on]))
 
     async def stop(self, link: Link) -> None:
-        await self._ask(link, _STREAM, b"\0")
+        if not self._was_on:  # the maker's example expects a board that sends from its power-up
+            await self._ask(link, _STREAM, b"\0")
 
     async def probe(self, link: Link, patch: Patch) -> bool:  # noqa: ARG002
         """Return whether the board answers; False if it was switched off."""

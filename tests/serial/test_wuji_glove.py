@@ -11,6 +11,7 @@ from skinware import PatchState, Status
 from skinware.errors import RequestFailed
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.virtual import Device
 from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
@@ -32,6 +33,8 @@ def test_the_emulated_board_byte_for_byte() -> None:
     assert board.answers(message(0x56, b"\x99\1\2\0")) == [message(0x57, b"\x99\1\2\0\x12")]
     assert board.answers(message(0x56, b"\1\4\3\0")) == [message(0x57, b"\1\4\3\0\x13")]
     assert board.answers(message(0x56, b"\2\5\4\0\2\0\0\x64\0")) == [message(0x57, b"\2\5\4\0\0")]
+    assert board.answers(message(0x56, b"\2\1\6\0")) == [message(0x57, b"\2\1\6\0\0emulated")]
+    assert board.answers(message(0x56, b"\1\5\7\0\1\0")) == [message(0x57, b"\1\5\7\0\0\1\0")]
     answer, *frames = board.answers(message(0x56, b"\1\4\5\0\1"), 45)
     assert answer == message(0x57, b"\1\4\5\0\0")
     assert len(frames) in (4, 5)
@@ -65,6 +68,21 @@ def test_values_invalid_cells_and_operations() -> None:
         read_until(reader, lambda f: f.patch_state[0] != PatchState.LIVE)
         reader.call("enable")
         read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE)
+
+
+@pytest.mark.parametrize("streaming", [True, False])
+def test_the_stream_is_left_as_it_was_found(streaming: bool) -> None:
+    """The maker's example never switches it on."""
+    stopped = []
+
+    class Watched(EmulatedWujiGlove):
+        def stop(self, device: Device) -> None:
+            stopped.append(device.number)
+            super().stop(device)
+
+    with emulated_skin(WujiGloveDriver, Watched, streaming=streaming) as skin:
+        read_until(skin.reader, lambda f: f.patch_state[0] == PatchState.LIVE)
+    assert stopped == ([] if streaming else [1])
 
 
 def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:

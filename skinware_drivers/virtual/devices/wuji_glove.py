@@ -16,7 +16,7 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 _OK, _BAD_LENGTH, _BAD_CHECKSUM, _UNKNOWN, _BAD_PAYLOAD = 0x00, 0x10, 0x11, 0x12, 0x13
-_NEEDED = {0x0101: 0, 0x0103: 0, 0x0301: 0, 0x0401: 1, 0x0501: 2, 0x0502: 5}  # bytes of arguments
+_NEEDED = {0x0101: 0, 0x0102: 0, 0x0103: 0, 0x0301: 0, 0x0401: 1, 0x0501: 2, 0x0502: 5}  # bytes of arguments
 
 
 def message(sync: int, body: bytes) -> bytes:
@@ -78,6 +78,8 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
             return _BAD_PAYLOAD, b""
         if number == 0x0101:
             return _OK, b"EMULATED-1".ljust(24, b"\0") + bytes((1, 0, 0, 0, 1, 2, 3, 0))
+        if number == 0x0102:
+            return _OK, b"emulated"
         if number == 0x0103:
             return _OK, bytes([self.options.hand == "right"])
         if number == 0x0301:
@@ -89,13 +91,15 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
             else:
                 self.stop(device)
             return _OK, b""
-        return self._rate(device, arguments, now_ns)
+        return self._setting(device, arguments, now_ns)
 
     def _hz(self, device: Device) -> int:
         hz: int = device.memory.get("hz", round(1e3 / self.options.period_ms))
         return hz
 
-    def _rate(self, device: Device, arguments: bytes, now_ns: int) -> tuple[int, bytes]:
+    def _setting(self, device: Device, arguments: bytes, now_ns: int) -> tuple[int, bytes]:
+        if arguments == b"\1\0":
+            return _OK, bytes([1, device.streams_from_ns is not None])
         if arguments[:2] != b"\2\0":
             return _BAD_PAYLOAD, b""
         if len(arguments) == 2:

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from skinware_drivers.can.linkerhand import LinkerHandDriver, LinkerHandOptions
+from skinware_drivers.serial.ability_hand import AbilityHandDriver, AbilityHandOptions
 from skinware_drivers.serial.anyskin import AnySkinDriver, AnySkinOptions
 from skinware_drivers.testing.vectors import decode_frames, decode_stream
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
+from tests.peers.paxini_boards import known
 
 FOLDER = Path(__file__).parents[1] / "data" / "peers"
 HANDS = sorted(FOLDER.glob("linkerhand_*.json"))
@@ -80,3 +82,20 @@ def test_a_magnetic_skin_shows_what_its_makers_program_showed(file: Path) -> Non
         )
         assert np.asarray(shown.values, float).tolist() == theirs
     assert len({value for values in exchange["values"] for value in values}) > 3
+
+
+def test_a_hand_of_psyonic_shows_what_its_makers_program_showed() -> None:
+    """The program shows newtons, by its formula."""
+    exchange = kept(FOLDER / "ability_hand.json")
+    for answer, theirs in zip(exchange["answers"], exchange["values"], strict=True):
+        volts = decode_stream(AbilityHandDriver(AbilityHandOptions()), answer).values * 3.3 / 4096
+        assert (121591 * volts / (33000 + 10000 * volts) + 0.878894 * (volts > 0)).tolist() == pytest.approx(theirs)
+        assert len(set(theirs)) > 3
+
+
+@pytest.mark.parametrize("board", ["converter", "high_speed"])
+def test_a_board_of_paxini_shows_what_paxini_sdk_showed(board: str) -> None:
+    exchange = kept(FOLDER / f"paxini_{board}.json")
+    for frame, theirs in zip(exchange["frames"], exchange["values"], strict=True):
+        assert decode_stream(known(board), frame).values.tolist() == theirs
+        assert len(set(theirs)) > 10

@@ -16,6 +16,9 @@ from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
+
+import serial
 
 SKIN_EMULATE = ("skin-emulate", "-T", "60")
 
@@ -93,6 +96,20 @@ def tapped(port: str) -> Iterator[tuple[str, bytearray]]:
         thread.join()
         for each in (device, master, slave):
             os.close(each)
+
+
+@contextmanager
+def heard_by_pyserial() -> Iterator[bytearray]:
+    """Keep the bytes that this process reads with pyserial."""
+    heard, original = bytearray(), serial.Serial.read
+
+    def read(line: serial.Serial, size: int = 1) -> bytes:
+        data: bytes = original(line, size)
+        heard.extend(data)
+        return data
+
+    with patch.object(serial.Serial, "read", read):
+        yield heard
 
 
 def _short(value: Any) -> str:

@@ -17,11 +17,13 @@ HERE, PROJECT = Path(__file__).parent, Path(__file__).parents[2]
 NOT_HAD = (2, 77)
 """Exit statuses of tools whose program cannot be had on this machine."""
 SCRIPTS = {
+    "ability-hand": ("ability_hand.py",),
     "anyskin": ("magnetic.py", "anyskin", "anyskin"),
     "flexitac": ("flexitac_pad.py", "flexitac"),
     "linkerbot": ("linkerhand.py", "linkerbot"),
     "linkerbot-py": ("linkerhand.py", "linkerbot-py"),
     "reskin_sensor": ("magnetic.py", "reskin_sensor", "reskin_sensor"),
+    "paxini-sdk": ("paxini.py",),
     "pyrobotiqtactile": ("robotiq.py",),
     "bc_stark_sdk": ("revo2.py",),
     "bc-revo3-sdk": ("revo3.py",),

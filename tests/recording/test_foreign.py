@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import sqlite3
 import zipfile
 from collections.abc import Callable
@@ -470,7 +471,16 @@ def test_a_dump_of_yarp(tmp_path: Path, stamp: str) -> None:
         (tmp_path / "info.log").write_text(f"Type: Bottle;\nStamp: {stamp};\n[1400000000.0] /skin [connected]\n")
     names = ["sequence", "time", *(["received_time"] if stamp == "tx+rx" else []), "value"]
     assert list(open_source(tmp_path).tables[""]) == names
-    require(only(tmp_path / "data.log"), values)
+    ((name, series),) = imported(tmp_path / "data.log").items()
+    require(series, values)
+    assert name == re.sub(r"[^a-z0-9]+", "-", tmp_path.name.lower())[:32].strip("-")
+
+
+def test_a_dump_of_contacts_has_rows_of_different_lengths(tmp_path: Path) -> None:
+    (tmp_path / "data.log").write_text("1 1400000000.0\n2 1400000000.1\n3 1400000000.2 ((83507 4) (0.1 0.2 0.3))\n")
+    source = open_source(tmp_path)
+    with pytest.raises(ConfigurationError, match=r"line 3: 7 cells instead of 2: only ports with equally many numbers"):
+        whole(source, "", ["time"])
 
 
 def real_dumps() -> list[Path]:
@@ -552,6 +562,8 @@ MISTAKES = [
             "line 502: '1.938' is no number"),
     damaged("zone.csv", lambda path: path.write_text("time,taxel_0\n" + "2026-11-28T12:00:00Z,1\n" * 500 + "12:00,1\n"),
             "line 502: '12:00' in time is neither a date"),
+    damaged("lfs.csv", lambda path: path.write_text("version https://git-lfs.github.com/spec/v1\nsize 7\n"),
+            "only a pointer to the data: fetch them with git lfs pull"),
     damaged("a.csv.gz", lambda path: path.write_bytes(b"\x1f\x8b\x08" + bytes(50)), "packed by gzip: unpack it first"),
     damaged("a.feather", lambda path: path.write_bytes(b"ARROW1" + bytes(50)), "Feather is not read: write it as"),
     damaged("a.mat", lambda path: path.write_bytes(b"MATLAB 5.0 MAT-file" + bytes(150)), "MAT-files are not read"),

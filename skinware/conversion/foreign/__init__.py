@@ -15,6 +15,7 @@ from skinware.errors import ConfigurationError
 __all__ = ["ColumnSource", "ImportedSource", "guess", "open_source"]
 
 _INSTEAD = {
+    b"version https://git-lfs": "only a pointer to the data: fetch them with git lfs pull",
     b"\x1f\x8b": "packed by gzip: unpack it first",
     b"\x28\xb5\x2f\xfd": "packed by zstd: unpack it first",
     b"ARROW1": "Feather is not read: write it as Parquet",
@@ -22,8 +23,8 @@ _INSTEAD = {
     b"\x89HDF": "HDF5 is not read: export its arrays with numpy.savez, or as CSV",
     b"\x93NUMPY": "one array without a name: save it with numpy.savez",
 }
-_MCAP_HEAD = 64
-"""Bytes that show which program wrote an MCAP file."""
+_BEGINNING = 64
+"""Bytes that show the format, and which program wrote an MCAP file."""
 
 
 def open_source(path: Path) -> ColumnSource:
@@ -49,7 +50,7 @@ def open_source(path: Path) -> ColumnSource:
             return ParquetSource(path)
         raise ConfigurationError(f"{path}: a folder without metadata.yaml, meta/info.json, data.log or Parquet files")
     with path.open("rb") as file:
-        begin = file.read(_MCAP_HEAD)
+        begin = file.read(_BEGINNING)
     for magic, why in _INSTEAD.items():
         if begin.startswith(magic):
             raise ConfigurationError(f"{path}: {why}")

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.conversion.foreign.mapping import FORMAT, UNITS_NS, VERSION, ModuleMap
-from skinware.conversion.foreign.source import ColumnSource, Rows, first_rows
+from skinware.conversion.foreign.source import DUMP, ColumnSource, Rows, first_rows
 from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 
@@ -76,7 +76,8 @@ def guess(source: ColumnSource) -> str:
         f'format = "{FORMAT}"',
         f"version = {VERSION}",
     ]
-    name = "" if len(chosen) > 1 else source.path.stem
+    place = source.path.resolve()
+    name = "" if len(chosen) > 1 else place.parent.name if place.name == DUMP else place.stem
     found = [_driver(source, table, tables, times[table], name or table) for table in chosen]
     if not any(found):
         raise ConfigurationError(f"{source.path}: nothing looks like taxels; {_overview(source, tables)}")

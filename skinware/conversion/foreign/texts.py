@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from skinware.conversion.foreign.source import ColumnSource, Rows
+from skinware.conversion.foreign.source import DUMP, ColumnSource, Rows
 from skinware.errors import ConfigurationError
 
 _READ_BYTES = 1 << 20
@@ -25,7 +25,7 @@ _MISSING = ("", "-", "nan", "null", "none", "na", "n/a", "#n/a", "<na>")
 _EXACT = 1 << 53
 """From this number on, a float does not hold every integer."""
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
-_DUMPED = re.compile(r"\d+ \d+(\.\d+)? \S")
+_DUMPED = re.compile(r"\d+ \d+(\.\d+)?( |$)")
 _BRACKETS = str.maketrans("()", "  ")
 _COMMAS = str.maketrans(",.", ".,")
 """Of a text with decimal commas; a point in it then makes no number."""
@@ -44,7 +44,7 @@ class TextSource(ColumnSource):
         super().__init__(path)
         with path.open("rb") as file:
             lines = self._lines_of([file.readline(_READ_BYTES) for _ in range(_SAMPLE_LINES)], 0)
-        self._is_dump = path.name == "data.log" and any(map(_DUMPED.match, lines[:5]))
+        self._is_dump = path.name == DUMP and any(map(_DUMPED.match, lines[:5]))
         self._skipped = _heading(lines)
         data = [line for line in lines[self._skipped :] if line.strip()]
         if not data:
@@ -105,7 +105,8 @@ class TextSource(ColumnSource):
         info = self.path.with_name("info.log")
         has_both = info.exists() and "tx+rx" in info.read_text(errors="replace")
         names = ["sequence", "time", *(["received_time"] * has_both)]
-        return {name: [number] for number, name in enumerate(names)} | {"value": list(range(len(names), count))}
+        places = {name: [number] for number, name in enumerate(names)}
+        return places | ({"value": list(range(len(names), count))} if count > len(names) else {})
 
     def _clean(self, line: str) -> str:
         return line.translate(self._letters) if self._letters else line
@@ -189,7 +190,13 @@ class TextSource(ColumnSource):
         for number, line in enumerate(lines, first):
             cells = self._cells(line) if line.strip() else []
             if cells and len(cells) != self._count:
-                self._damaged(number, f"{len(cells)} cells instead of {self._count}")
+                where = f"{self.path}, line {number}: {len(cells)} cells instead of {self._count}: "
+                what = "mend or remove the line"
+                if self._is_dump:
+                    what = (
+                        "only ports with equally many numbers in each message can be read, as those of a skin's taxels"
+                    )
+                raise ConfigurationError(where + what)
             if cells:
                 yield number, cells
 

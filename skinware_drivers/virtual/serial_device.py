@@ -233,12 +233,6 @@ class ModbusEmulator(SerialEmulator[OptionsT]):
         return _reply(asked, bytes([message[0] | 0x80, _NO_SUCH_REGISTERS]))
 
 
-def text_registers(address: int, text: str) -> dict[int, int]:
-    """Return ten registers with a text: address -> two letters, the first in the high byte."""
-    data = text.encode().ljust(20, b"\0")
-    return {address + place: int.from_bytes(data[2 * place : 2 * place + 2], "big") for place in range(10)}
-
-
 def _read_from(known: Mapping[int, int], asked: _Asked, step: int) -> bytes:
     address, count = int.from_bytes(asked.message[1:3], "big"), int.from_bytes(asked.message[3:5], "big")
     wanted = range(address, address + count * step, step)

@@ -15,27 +15,22 @@ import pytest
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5UdpDriver
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
-from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.can.xela import CyskinCpmDriver, XelaDriver
 from skinware_drivers.modbus.dfrobot import DfrobotDriver
 from skinware_drivers.modbus.inspire import InspireDriver
 from skinware_drivers.modbus.revo2 import Revo2Driver
 from skinware_drivers.modbus.revo3 import Revo3Driver
 from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
-from skinware_drivers.serial.anyskin import AnySkinDriver
-from skinware_drivers.serial.dev001 import Dev001Driver
+from skinware_drivers.serial.boards import AnySkinDriver, SkintalkDriver, TactileGloveDriver
+from skinware_drivers.serial.contactile import Dev001Driver, PapillArrayDriver
 from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
-from skinware_drivers.serial.papillarray import PapillArrayDriver
 from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.robotiq_tsf import RobotiqTsfDriver
-from skinware_drivers.serial.skintalk import SkintalkDriver
-from skinware_drivers.serial.tactile_glove import TactileGloveDriver
-from skinware_drivers.serial.weiss_dsa import WeissDsaDriver
-from skinware_drivers.serial.weiss_wts import WeissWtsDriver
+from skinware_drivers.serial.weiss import WeissDsaDriver, WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.streams.dex3 import Dex3Driver
 from skinware_drivers.streams.icub_eth import IcubEthDriver
@@ -43,39 +38,32 @@ from skinware_drivers.streams.ros2 import Ros2Driver
 from skinware_drivers.streams.tesollo import TesolloDriver
 from skinware_drivers.streams.xela_server import XelaServerDriver
 from skinware_drivers.streams.yarp import YarpDriver
-from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
-from skinware_drivers.virtual.devices.agni import EmulatedAgni
-from skinware_drivers.virtual.devices.allegro_v5 import (
+from skinware_drivers.virtual.devices.boards import (
+    EmulatedAgni,
+    EmulatedAnySkin,
+    EmulatedCyskinCpm,
+    EmulatedFlexiTac,
+    EmulatedRobotiqTsf,
+    EmulatedSkintalk,
+)
+from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
+from skinware_drivers.virtual.devices.contactile import EmulatedDev001, EmulatedPapillArray
+from skinware_drivers.virtual.devices.gloves import EmulatedTactileGlove, EmulatedWujiGlove
+from skinware_drivers.virtual.devices.hands import (
+    EmulatedAbilityHand,
     EmulatedAllegroV5,
     EmulatedAllegroV5Tips,
     EmulatedAllegroV5Udp,
+    EmulatedBarrett,
+    EmulatedTesollo,
 )
-from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
-from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
-from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
-from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
-from skinware_drivers.virtual.devices.dev001 import EmulatedDev001
-from skinware_drivers.virtual.devices.dex3 import EmulatedDex3
-from skinware_drivers.virtual.devices.dfrobot import EmulatedDfrobot
-from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
-from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
-from skinware_drivers.virtual.devices.inspire import EmulatedInspire
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
+from skinware_drivers.virtual.devices.networks import EmulatedDex3, EmulatedIcubEth, EmulatedRos2, EmulatedYarp
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
-from skinware_drivers.virtual.devices.papillarray import EmulatedPapillArray
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
-from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2
-from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3
-from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf
-from skinware_drivers.virtual.devices.ros2 import EmulatedRos2
-from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
-from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
-from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
-from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa
-from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts
-from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
+from skinware_drivers.virtual.devices.registers import EmulatedDfrobot, EmulatedInspire, EmulatedRevo2, EmulatedRevo3
+from skinware_drivers.virtual.devices.weiss import EmulatedWeissDsa, EmulatedWeissWts
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaServer
-from skinware_drivers.virtual.devices.yarp import EmulatedYarp
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions

@@ -15,23 +15,22 @@ from skinware_drivers.can import roboskin_setup
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
-from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_layout import RoboskinOptions
-from skinware_drivers.can.xela import XelaDriver
+from skinware_drivers.can.xela import CyskinCpmDriver, XelaDriver
 from skinware_drivers.finding import looking
 from skinware_drivers.finding.looking import HeardOnBus, ProbeAnswer, ask, ask_port, listen
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.devices.allegro_v5 import (
+from skinware_drivers.virtual.devices.boards import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
+from skinware_drivers.virtual.devices.hands import (
     EmulatedAllegroV5,
     EmulatedAllegroV5Options,
     EmulatedAllegroV5Tips,
     EmulatedAllegroV5TipsOptions,
 )
-from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.hardware import EmulatedHardware, Event

@@ -22,7 +22,7 @@ from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.driving import emulated_on_a_pty
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.devices.dfrobot import EmulatedDfrobot, EmulatedDfrobotOptions
+from skinware_drivers.virtual.devices.registers import EmulatedDfrobot, EmulatedDfrobotOptions
 from tests.modbus.peers import Action, device, rtu_server
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, with_options
 

@@ -23,7 +23,7 @@ from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.devices.inspire import EmulatedInspire, EmulatedInspireOptions
+from skinware_drivers.virtual.devices.registers import EmulatedInspire, EmulatedInspireOptions
 from skinware_drivers.virtual.hardware import WireFrame
 from tests.modbus.peers import device, rtu_server, tcp_server
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options

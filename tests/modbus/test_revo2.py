@@ -21,7 +21,7 @@ from skinware_drivers.polling import Notice
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.driving import driving_lines, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2, EmulatedRevo2Options
+from skinware_drivers.virtual.devices.registers import EmulatedRevo2, EmulatedRevo2Options
 from tests.modbus.peers import Action, device, rtu_server
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options
 

@@ -18,7 +18,7 @@ from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.driving import driving_lines, emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual import Device
-from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3, EmulatedRevo3Options
+from skinware_drivers.virtual.devices.registers import EmulatedRevo3, EmulatedRevo3Options
 from tests.modbus.peers import Action, rtu_server
 from tests.modbus.peers import device as server_device
 from tests.modbus.rig import PATIENTLY, PYMODBUS, driven, patient, with_options

@@ -249,7 +249,7 @@ def test_what_cannot_be_written_is_said_before_somebody_walks(tmp_path: Path) ->
 @pytest.mark.thorough
 def test_a_driver_whose_author_prints_is_heard_nevertheless(tmp_path: Path, tcp_patch: Callable[..., str]) -> None:
     (tmp_path / "noisy.py").write_text(
-        "from skinware_drivers.serial.weiss_wts import WeissWtsDriver\n\n\n"
+        "from skinware_drivers.serial.weiss import WeissWtsDriver\n\n\n"
         "class Noisy(WeissWtsDriver):\n"
         "    def __init__(self, options):\n"
         "        print('here I am')\n"

@@ -10,12 +10,12 @@ import pytest
 
 from skinware.errors import HandshakeTimeout
 from skinware.status import Status
-from skinware_drivers.serial.dev001 import Dev001Driver, Dev001Options
+from skinware_drivers.serial.contactile import Dev001Driver, Dev001Options
 from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.waiting import read_until
-from skinware_drivers.virtual.devices.dev001 import EmulatedDev001, EmulatedDev001Options
+from skinware_drivers.virtual.devices.contactile import EmulatedDev001, EmulatedDev001Options
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.drivers.test_conformance import TestDev001 as Conformance
 from tests.serial.spoken import Spoken

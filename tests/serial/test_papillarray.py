@@ -11,13 +11,13 @@ import pytest
 
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.status import PatchState, Status
-from skinware_drivers.serial.papillarray import PapillArrayDriver
+from skinware_drivers.serial.contactile import PapillArrayDriver
 from skinware_drivers.serial.papillarray_packets import PapillArrayPackets
 from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.waiting import read_until
-from skinware_drivers.virtual.devices.papillarray import EmulatedPapillArray, EmulatedPapillArrayOptions
+from skinware_drivers.virtual.devices.contactile import EmulatedPapillArray, EmulatedPapillArrayOptions
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.drivers.test_conformance import TestPapillArray as Conformance
 from tests.serial.spoken import Spoken

@@ -12,9 +12,10 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.link import Link
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.framing import Framed
-from skinware_drivers.serial.weiss_dsa import WeissDsaDriver, WeissDsaOptions, _expanded, _Matrix
+from skinware_drivers.serial.weiss import WeissDsaDriver, WeissDsaOptions, _expanded, _Matrix
 from skinware_drivers.testing.driving import emulated_skin
-from skinware_drivers.virtual.devices.weiss_dsa import EmulatedWeissDsa, EmulatedWeissDsaOptions, message
+from skinware_drivers.virtual.devices.weiss import EmulatedWeissDsa, EmulatedWeissDsaOptions
+from skinware_drivers.virtual.devices.weiss import dsa_message as message
 from tests.sdk.driving import read_until
 from tests.serial.spoken import Spoken
 

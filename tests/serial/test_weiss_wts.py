@@ -8,9 +8,9 @@ import pytest
 
 from skinware import DriverSnapshot, PatchState
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.weiss_wts import WeissWtsDriver, WeissWtsOptions
+from skinware_drivers.serial.weiss import WeissWtsDriver, WeissWtsOptions
 from skinware_drivers.testing.driving import emulated_skin
-from skinware_drivers.virtual.devices.weiss_wts import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
+from skinware_drivers.virtual.devices.weiss import EmulatedWeissWts, EmulatedWeissWtsOptions, crc, message
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
 

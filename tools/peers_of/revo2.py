@@ -9,7 +9,7 @@ from typing import Any
 
 from brainco import Comparison, at_a_port
 
-from skinware_drivers.virtual.devices.revo2 import EmulatedRevo2
+from skinware_drivers.virtual.devices.registers import EmulatedRevo2
 
 _UNIT = 127
 _FORCES = [1000, 20, 300, 1, 2, 3, 2500, 7, 359, 4, 5, 6, 7, 8, 9]

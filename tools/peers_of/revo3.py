@@ -9,7 +9,7 @@ from typing import Any
 
 from brainco import Comparison, at_a_port
 
-from skinware_drivers.virtual.devices.revo3 import EmulatedRevo3
+from skinware_drivers.virtual.devices.registers import EmulatedRevo3
 
 _POINTS = [36, 31, 57, 21, 52, 21, 52, 21, 52, 21, 52]
 _MATRIX = [53, 56, 22, 22, 27, 22, 27, 22, 27, 22, 27]

@@ -17,7 +17,7 @@ from skinware.errors import ConfigurationError, SkinwareError
 Rows = dict[str, npt.NDArray[Any]]
 """m rows of columns, (m, ...) by name: numbers; times that a file has as such are int64 ns, dates since 1970."""
 DUMP = "data.log"
-"""What YARP's datadumper calls each of its files; the folder has a name."""
+"""The file of YARP's datadumper, whose folder has the name."""
 BLOCK_BYTES = 4 << 20
 """Size of the rows that a source reads together."""
 

@@ -28,7 +28,7 @@ _DATE = re.compile(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)([.,]\d+)?(Z|[+-]\d\d:?\
 _DUMPED = re.compile(r"\d+ \d+(\.\d+)?( |$)")
 _BRACKETS = str.maketrans("()", "  ")
 _COMMAS = str.maketrans(",.", ".,")
-"""Of a text with decimal commas; a point in it then makes no number."""
+"""Decimal commas become points; a point then makes no number."""
 _BY_COMMA, _BY_POINT = (re.compile(rf"[-+]?\d*{mark}\d+(e[-+]?\d+)?", re.I) for mark in (",", r"\."))
 _IN_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 

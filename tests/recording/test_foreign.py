@@ -305,7 +305,8 @@ def write_dataset(folder: Path, lengths: list[int], version: str = "v3.0") -> np
 
 def test_a_dataset_of_lerobot(tmp_path: Path) -> None:
     values = write_dataset(tmp_path / "set", [20, 31, 15])
-    series = only(tmp_path / "set")
+    ((name, series),) = imported(tmp_path / "set").items()
+    assert name == "set"
     starts = np.repeat([0, 1.9 + 1, 1.9 + 1 + 3.0 + 1], [20, 31, 15])
     steps = np.concatenate([np.arange(length, dtype=np.float32) / np.float32(10) for length in (20, 31, 15)])
     require(series, values, starts + steps)
@@ -519,6 +520,12 @@ def zipped(path: Path, name: str, data: bytes, method: int = 0) -> None:
     path.write_bytes(data.replace(b"PK\1\2\x14\3\x14\0\0\0\0", b"PK\1\2\x14\3\x14\0\0\0" + bytes([method])))
 
 
+def spoiled(path: Path, change: Callable[[Path], object]) -> None:
+    write_dataset(path, [3])
+    for table in path.rglob("*.parquet"):
+        change(table)
+
+
 MISTAKES = [
     damaged("no.csv", lambda path: path.write_text("hello\nworld\n"), "no line with numbers in it"),
     damaged("none.csv", lambda path: path.write_text(""), "no line with numbers in it"),
@@ -574,6 +581,9 @@ MISTAKES = [
     damaged("cut.parquet", lambda path: cut(path, lambda path: pa.parquet.write_table(pa.table({"t": TIMES}), path)),
             "not Parquet, or damaged"),
     damaged("old", lambda path: write_dataset(path, [3], "v2.1"), "a dataset of LeRobot v2.1: convert it to v3.0"),
+    damaged("bare", lambda path: spoiled(path, Path.unlink), "bare/data: no Parquet file in it: fetch the whole"),
+    damaged("pointers", lambda path: spoiled(path, lambda each: each.write_text("version https://git-lfs.github.com")),
+            "only a pointer to the data: fetch them with git lfs pull"),
     damaged("empty", lambda path: path.mkdir(), "a folder without metadata.yaml"),
     damaged("bad.bag", lambda path: path.write_bytes(b"#ROSBAG V2.0\n" + bytes(50)), "no bag of ROS, or damaged"),
     damaged("own.mcap", lambda path: path.write_bytes(b"\x89MCAP0\r\n\1\x1e" + bytes(7) + b"\x08\0\0\0skinware"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from skinware.conversion.foreign.guessing import guess
 from skinware.conversion.foreign.importing import ImportedSource
-from skinware.conversion.foreign.source import ColumnSource
+from skinware.conversion.foreign.source import DUMP, ColumnSource
 from skinware.errors import ConfigurationError
 
 __all__ = ["ColumnSource", "ImportedSource", "guess", "open_source"]
@@ -40,20 +40,19 @@ def open_source(path: Path) -> ColumnSource:
     from skinware.conversion.foreign.texts import TextSource
 
     if path.is_dir():
+        table = next(path.rglob("*.parquet"), None)
+        if table is not None:
+            _beginning(table)
         if (path / "meta" / "info.json").exists():
             return DatasetSource(path)
         if (path / "metadata.yaml").exists():
             return BagSource(path)
-        if (path / "data.log").exists():
-            return TextSource(path / "data.log")
-        if next(path.rglob("*.parquet"), None):
+        if (path / DUMP).exists():
+            return TextSource(path / DUMP)
+        if table is not None:
             return ParquetSource(path)
         raise ConfigurationError(f"{path}: a folder without metadata.yaml, meta/info.json, data.log or Parquet files")
-    with path.open("rb") as file:
-        begin = file.read(_BEGINNING)
-    for magic, why in _INSTEAD.items():
-        if begin.startswith(magic):
-            raise ConfigurationError(f"{path}: {why}")
+    begin = _beginning(path)
     if begin.startswith(b"\x89MCAP") and b"skinware" in begin:
         raise ConfigurationError(f"{path}: a recording already, which needs no map")
     if begin.startswith((b"#ROSBAG", b"\x89MCAP", b"SQLite format")):
@@ -61,3 +60,12 @@ def open_source(path: Path) -> ColumnSource:
     if begin.startswith(b"PK"):
         return NpzSource(path)
     return ParquetSource(path) if begin.startswith(b"PAR1") else TextSource(path)
+
+
+def _beginning(path: Path) -> bytes:
+    with path.open("rb") as file:
+        begin = file.read(_BEGINNING)
+    for magic, why in _INSTEAD.items():
+        if begin.startswith(magic):
+            raise ConfigurationError(f"{path}: {why}")
+    return begin

@@ -130,7 +130,9 @@ class ParquetSource(ColumnSource):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._arrow = pyarrow()
-        self._paths = sorted(path.rglob("*.parquet")) if path.is_dir() else [path]
+        self._paths = [path] if path.is_file() else sorted(path.rglob("*.parquet"))
+        if not self._paths:
+            raise ConfigurationError(f"{path}: no Parquet file in it: fetch the whole dataset")
         self._rows = 0
         for each in self._paths:
             with self._opened(each) as file:
@@ -191,9 +193,8 @@ class DatasetSource(ParquetSource):
             raise ConfigurationError(f"{path}/meta/info.json: damaged: it does not say codebase_version") from None
         if not version.startswith("v3"):
             raise ConfigurationError(f"{path}: a dataset of LeRobot {version}: convert it to v3.0 with LeRobot first")
-        if not (path / "data").is_dir():
-            raise ConfigurationError(f"{path}: no folder data in it: fetch the whole dataset")
         super().__init__(path / "data")
+        self.path = path
         marks: list[tuple[float, str]] = []
         self._begins: dict[int, float] = {}
         end_s = -_EPISODE_GAP_S

@@ -1,4 +1,4 @@
-"""What the kernel and error frames report about the controller of a CAN interface: rates, state, troubles, stamps."""
+"""The controller of a CAN interface, as the kernel and error frames report it: rates, state, troubles, stamps."""
 
 from __future__ import annotations
 

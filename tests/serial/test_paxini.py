@@ -309,12 +309,12 @@ def test_a_silent_board_is_found_and_calibrated() -> None:
 class AsItsText(EmulatedPaxini):
     """It has the numbers of taxels on the palm where the maker's text has them, and may stream fewer kinds of data."""
 
-    kinds = 3
+    n_kinds = 3
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
         register = command[4]
         if command[3] == 3 and register == 0x16:
-            return message(b"\xaa\x55\0", command[3:8], bytes([self.kinds]))
+            return message(b"\xaa\x55\0", command[3:8], bytes([self.n_kinds]))
         if command[3] == 3 and 0x58 <= register < 0x68:
             return message(b"\xaa\x55\0", command[3:8], b"\x09\0")
         if command[3] == 3 and register >= 0x68:
@@ -330,7 +330,7 @@ def test_taxels_of_the_palm_are_found_at_either_register() -> None:
 def test_a_board_that_streams_one_kind_of_data_is_refused_in_words(caplog: pytest.LogCaptureFixture) -> None:
     class OnlyAtFirst(AsItsText):
         def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
-            self.kinds = 3 if "alone: write 3" in caplog.text else 1
+            self.n_kinds = 3 if "alone: write 3" in caplog.text else 1
             return super().answer(device, command, now_ns)
 
     with emulated_skin(PaxiniDriver, OnlyAtFirst, driver_options={"board": "high_speed"}, **HAND) as skin:

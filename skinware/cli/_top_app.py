@@ -152,7 +152,7 @@ class SkinTop(App[None]):
     }
     .-low #list { max-height: 40%; }
     #above { height: 1; background: #22304f; color: #e0e0e0; padding: 0 1; }
-    #title { width: 1fr; text-style: bold; }
+    #title { width: 1fr; padding-right: 1; text-style: bold; }
     #scale { width: auto; }
     #map { height: 1fr; margin: 0 1; background: #121212; scrollbar-size-vertical: 1; }
     #contacts { height: 20%; min-height: 2; max-height: 9; padding: 0 1; }

@@ -463,13 +463,15 @@ NUMBERED = """(() => {
     stage.camera = { position: { toArray: () => [0, 0, 9] } };
     stage.project = (x, y) => [x, y, 1];
     const overlay = new m.Overlay(document.body), written = [];
-    overlay.context.fillText = (text) => written.push(text);
-    overlay.draw(stage, { theme: "dark", names: [], pins: [], hovered: null, contacts: a[0] });
+    overlay.context.fillText = (text, x) => written.push([text, Math.round(x)]);
+    overlay.draw(stage, { theme: "dark", names: a[1], pins: [], hovered: null, contacts: a[0] });
     return written;
 })()"""
 
 
 def test_the_largest_contacts_have_numbers_and_none_covers_another(tell: Callable[..., Any]) -> None:
-    places = [(7, 100, 3), (23, 108, 9), (38, 104, 1), (41, 200, 2)]
+    places = [(7, 100, 3), (23, 108, 9), (38, 104, 1), (41, 200, 2), (52, 104, 0.5), (60, 104, 0.4)]
     contacts = [{"id": number, "at": [x, 50, 0], "load": load} for number, x, load in places]
-    assert tell("overlay.js", NUMBERED, contacts) == ["23", "41"]
+    assert tell("overlay.js", NUMBERED, contacts, []) == [["23", 123], ["7", 85], ["41", 215], ["38", 119], ["52", 89]]
+    name = {"text": "palm", "x": 220, "y": 35, "width": 24, "alpha": 1}
+    assert tell("overlay.js", NUMBERED, contacts[3:4], [name]) == [["41", 185], ["palm", 220]]

@@ -97,6 +97,7 @@ export class Cards {
     this.tip = tip;
     this.pins = pins;
     this.release = release;
+    this.at = [0, 0];
     this.empty = h(
       "p",
       { class: "hint" },
@@ -123,6 +124,7 @@ export class Cards {
     }
     setHidden(this.tip, !hovered);
     this.tipCard?.update(past);
+    if (hovered) this.place(...this.at);
     for (const probe of this.#cards.keys()) if (!probes.pins.includes(probe)) this.#cards.delete(probe);
     for (const probe of probes.pins) {
       if (!this.#cards.has(probe)) this.#cards.set(probe, new Card(probe, this.plotting, () => this.release(probe)));
@@ -133,7 +135,9 @@ export class Cards {
   }
 
   /** Put the card of the hovered taxel beside a place of the view. */
-  place(x, y, width, height) {
+  place(x, y) {
+    this.at = [x, y];
+    const { clientWidth: width, clientHeight: height } = this.tip.parentElement;
     const left = x + 18 + this.tip.offsetWidth < width ? x + 18 : Math.max(4, x - 18 - this.tip.offsetWidth);
     const top = Math.max(4, Math.min(y - 20, height - this.tip.offsetHeight - 8));
     this.tip.style.transform = `translate(${Math.round(left)}px, ${Math.round(top)}px)`;

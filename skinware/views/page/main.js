@@ -407,7 +407,7 @@ function step(by) {
   const { name } = probes.hovered;
   setText(byId("spoken"), `${name}: ${measure(found.sheet.valueOf(found.i), found.sheet.unit)}`);
   const [x, y] = stage.project(...found.sheet.place(found.i));
-  cards.place(x, y, stage.width, stage.height);
+  cards.place(x, y);
 }
 
 function release() {
@@ -472,7 +472,7 @@ onPointer(byId("stage"), {
   over: (x, y) => {
     if (x !== null) grip.show(view.names && labelAt(names.place(stage), x, y));
     hover(x === null ? null : pick(stage, stage.sheets, x, y));
-    cards.place(x, y, stage.width, stage.height);
+    cards.place(x, y);
   },
   click: (x, y) => {
     const label = view.names && labelAt(names.place(stage), x, y);

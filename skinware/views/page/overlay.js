@@ -8,6 +8,7 @@ const MOST_ARROWS = 8000;
 const NORMAL_LENGTH = 1.6; // in radii of a taxel
 const SHEAR_LENGTH = 2.4; // in radii, of the strongest shear
 const LEAST_SHEAR = 3; // of 127
+const CORNERS = [[1, -1], [-1, -1], [1, 1], [-1, 1]]; // of a contact, right and down, for its number
 const HIDDEN = 0.35; // how much of a contact on the far side is seen
 
 export class Overlay {
@@ -38,9 +39,9 @@ export class Overlay {
       if (what.normals) this.#normals(stage, sheet);
       if (sheet.shown.shear) this.#shear(stage, sheet);
     }
+    const labels = [...what.names]; // and numbers of the largest contacts; those without a free place are left out
+    for (const contact of [...what.contacts].sort((a, b) => b.load - a.load)) this.#contact(stage, contact, labels);
     for (const name of what.names) this.#name(name);
-    const numbers = []; // of the largest; those that would cover them are left out
-    for (const contact of [...what.contacts].sort((a, b) => b.load - a.load)) this.#contact(stage, contact, numbers);
     for (const { sheet, i, letter } of what.pins) this.#ring(stage, sheet, i, letter);
     if (what.hovered) this.#ring(stage, what.hovered.sheet, what.hovered.i, "");
   }
@@ -81,7 +82,7 @@ export class Overlay {
     this.#stroke(1.6);
   }
 
-  #contact(stage, contact, numbers) {
+  #contact(stage, contact, labels) {
     const at = contact.at;
     const [x, y, depth] = stage.project(...at);
     if (depth <= 0) return;
@@ -101,9 +102,11 @@ export class Overlay {
       this.#stroke(2);
     }
     const text = String(contact.id);
-    const number = { text, width: widthOf(text) + 10, x: x + 0.72 * size + 8, y: y - 0.72 * size - 8 };
-    if (!numbers.some((other) => areOver(number, other))) {
-      numbers.push(number);
+    const away = 0.72 * size + 8;
+    const places = CORNERS.map(([right, down]) => ({ width: widthOf(text) + 10, x: x + right * away, y: y + down * away }));
+    const number = places.find((place) => !labels.some((other) => areOver(place, other)));
+    if (number) {
+      labels.push(number);
       this.#tag(text, number.x, number.y);
     }
     context.globalAlpha = 1;

@@ -46,7 +46,8 @@ class Item {
     this.element.dataset.severity = severity;
     this.what.disabled = !key;
     setText(this.what, text);
-    setText(this.since, since_ns ? `for ${age((now_ns - since_ns) / 1e6)}` : "");
+    const since_ms = (now_ns - since_ns) / 1e6;
+    setText(this.since, since_ns ? (since_ms < 1000 ? "just now" : `for ${age(since_ms)}`) : "");
     setHidden(this.more, !findings.length);
     const told = JSON.stringify(findings);
     if (told === this.told) return;

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import socket
+import struct
 
 import pytest
 
@@ -31,6 +32,12 @@ def test_a_datagram_is_taken_apart_to_can_frames() -> None:
     framer = rops(1).framer()
     assert framer.feed(DATAGRAM) == [Framed(0x473, HEAD, 84), Framed(0x473, TAIL, 84)]
     assert (framer.counters.frames, framer.counters.frame_bytes, framer.pending) == (1, 84, 0)
+
+
+def test_operations_of_the_emulated_board_have_whole_words() -> None:
+    """The robot's newer parser (embot_prot_eth_rop.cpp) reads no others."""
+    [joint_size] = struct.unpack_from("<H", datagram(0, [(0x473, HEAD)], 1, 0), 26)
+    assert joint_size % 4 == 0
 
 
 def test_the_second_skin_is_on_another_port() -> None:

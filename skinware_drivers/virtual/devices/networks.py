@@ -134,7 +134,7 @@ def datagram(skin: int, records: Sequence[tuple[int, bytes]], number: int, time_
     """Return a frame with one signal of a skin, with all its room, after another variable, as in real frames."""
     items = b"".join(struct.pack("<H8s", len(data) << 12 | can, data) for can, data in records)
     array = struct.pack("<BBBB", _ROOM, 10, len(records), 0) + items.ljust(10 * _ROOM, b"\0")
-    joint = struct.pack("<BBHI", 0, 4, 5, 0x0100_0004) + b"joint".ljust(8, b"\0")
+    joint = struct.pack("<BBHI", 0, 4, 8, 0x0100_0004) + b"a joint\0"
     signal = joint + struct.pack("<BBHI", 0, 4, len(array), 0x0300_0002 | skin << 8) + array
     return struct.pack("<IHHQQ", 0x12345678, len(signal), 2, time_us, number) + signal + struct.pack("<I", 0x87654321)
 

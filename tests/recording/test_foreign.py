@@ -563,6 +563,8 @@ MISTAKES = [
             "no column of numbers 'taxel_0'"),
     damaged("thousand.csv", lambda path: path.write_text("time;taxel_0\n0.1;1,938\n0.2;12\n"),
             "'0.1' and '1,938': is the comma or the point that of decimals? Export it without marks between thousands"),
+    damaged("spaces.txt", lambda path: path.write_text("0,00 1938,5\n0,01 1939,5\n"),
+            "'00 1938' between commas: export it with points and commas, or tabs"),
     damaged("marks.csv", lambda path: path.write_text("time;taxel_0\n1;1,938\n2;12\n"),
             "is '1,938' a number of thousands?"),
     damaged("point.csv", lambda path: path.write_text("time;taxel_0\n" + "0,5;1,5\n" * 500 + "1,0;1.938\n"),
@@ -656,6 +658,13 @@ def test_many_columns_with_numbers_are_taxels_beside_one_with_a_name(tmp_path: P
     assert 'kind = "4x4"' in text
     assert 'unit = "degC"' in text
     assert "not taken for taxels: joint_0, joint_1, joint_2, joint_3" in text
+
+
+@pytest.mark.parametrize("name", ["Zeit", "tempo_ms", "t (ms)"])
+def test_whole_times_are_found_by_name(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text(f"{name};taxel_0\n" + "".join(f"{10 * n};{7 * n % 5}\n" for n in range(9)))
+    require(only(path), (7 * np.arange(9) % 5)[:, None], TIMES[:9])
 
 
 def test_numbers_too_large_for_the_first_guess(tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ from skinware.errors import ConfigurationError
 from skinware.realtime import NS_PER_S
 
 _TIMES = re.compile(
-    r"(.*[_.\s])?(time|t|timestamp|stamp|unix|date|datetime)([_.\s(\[]*(s|sec|seconds|ms|us|ns|nsec)[)\]]?)?", re.I
+    r"(.*[_.\s])?(time|t|timestamp|stamp|unix|date|datetime|zeit|tempo|temps|tiempo)([_.\s(\[]*(s|sec|seconds|ms|us|ns|nsec)[)\]]?)?",
+    re.I,
 )
 _UNIT_OF_TIME = re.compile(r"[_.\s(\[](ms|us|ns|nsec|s|sec|seconds)[)\]]?$", re.I)
 _NO_TAXELS = re.compile(

@@ -30,6 +30,8 @@ _BRACKETS = str.maketrans("()", "  ")
 _COMMAS = str.maketrans(",.", ".,")
 """Decimal commas become points; a point then makes no number."""
 _BY_COMMA, _BY_POINT = (re.compile(rf"[-+]?\d*{mark}\d+(e[-+]?\d+)?", re.I) for mark in (",", r"\."))
+_TWO_NUMBERS = re.compile(r"[-+]?\d+\s+[-+]?\d+")
+"""Parts of two numbers with decimal commas, between which there are only spaces."""
 _IN_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 
 
@@ -115,9 +117,16 @@ class TextSource(ColumnSource):
         """Return the letters to exchange in each line, so that numbers have points."""
         if self._is_dump:
             return _BRACKETS
-        if self._separator not in ("\t", ";"):
+        if self._separator is None:
             return {}
         cells = [cell.strip() for line in lines for cell in self._cells(line)]
+        if self._separator == ",":
+            two = next(filter(_TWO_NUMBERS.fullmatch, cells), None)
+            if two is not None:
+                raise ConfigurationError(
+                    f"{self.path}: {two!r} between commas: export it with points and commas, or tabs"
+                )
+            return {}
         commas = [cell for cell in cells if _BY_COMMA.fullmatch(cell)]
         points = [cell for cell in cells if _BY_POINT.fullmatch(cell)]
         if commas and points:

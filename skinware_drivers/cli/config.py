@@ -46,9 +46,9 @@ class Declined(SkinwareError):
     metavar="DRIVER",
     help="Name or file of the driver, if none runs on the bus.  [default: roboskin]",
 )
-@click.option("-o", "--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
+@click.option("--option", "options", multiple=True, metavar="KEY=VALUE", help="Option of that driver.")
 @click.option("--config", metavar="FILE", type=cli.FILE, help="TOML file of that driver.")
-@click.option("-T", "timeout_s", type=cli.seconds, default="10", help="Wait SECONDS for a driver.")
+@click.option("--timeout", "timeout_s", metavar="SECONDS", type=cli.seconds, default="10", help="Wait for a driver.")
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @click.option("--force", is_flag=True, help="Make changes even if something is sending on the bus.")
 @cli.namespace_option
@@ -87,7 +87,7 @@ def command(
     if owner is not None:
         if driver_name or options or config or force:
             raise click.UsageError(
-                f"{owner} runs: its own options hold, so --driver, -o, --config, --force do not apply"
+                f"{owner} runs: its own options hold, so --driver, --option, --config, --force do not apply"
             )
         outcome = _through_driver(owner, of_bus, operation, given, timeout_s, yes)
     else:
@@ -180,7 +180,7 @@ def _adapter(
     file = ConfigFile(config)
     driver_type = driver_name or file.settings.driver or DEFAULT_DRIVER
     driver = load_driver(driver_type)
-    given = cli.pairs(options, "-o KEY=VALUE", with_empty=True)
+    given = cli.pairs(options, "--option KEY=VALUE", with_empty=True)
     adapter_class = NamedBus(bus_name, driver_type).choose(driver)
     return driver_type, adapter_class(file.options_of_bus(driver.Options, bus_name, given))
 

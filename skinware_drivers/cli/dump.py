@@ -36,7 +36,7 @@ _SHARED = ("socketcan", "udp_multicast", "virtual")
 @cli.command(
     "skin-dump",
     "skin-dump -n 3                              three snapshots",
-    "skin-dump -T 2 --type pressure              fail when nothing comes for 2 s",
+    "skin-dump --timeout 2 --type pressure       fail when nothing comes for 2 s",
     "skin-dump --json --rate 10 > frames.jsonl   at most ten snapshots a second",
     "skin-dump --raw can0 -n 1000 > can.log      for canplayer -I can.log",
 )
@@ -45,7 +45,6 @@ _SHARED = ("socketcan", "udp_multicast", "virtual")
     "-n", "count", type=click.IntRange(min=1), metavar="COUNT", help="End after COUNT snapshots, or frames of --raw."
 )
 @click.option(
-    "-T",
     "--timeout",
     "timeout_s",
     metavar="SECONDS",
@@ -175,7 +174,7 @@ def _only_driver(namespace: Namespace, end_s: float) -> str:
             if time.monotonic() >= end_s:
                 raise ServiceNotFound(
                     f"no driver in namespace {namespace.name!r}; start one: skin-driver --bus virtual"
-                    " (-T waits for one)"
+                    " (--timeout waits for one)"
                 )
             time.sleep(_LOOK_EVERY_S)
 

@@ -33,7 +33,7 @@ _MOST_CLASSES = 6
     "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
 )
 @click.argument("buses", nargs=-1, metavar="[BUS]...")
-@click.option("--listen", "listen_s", type=cli.seconds, default="1", help="Listen for SECONDS.")
+@click.option("--seconds", "listen_s", type=cli.seconds, default="1", help="Listen for SECONDS.")
 @click.option("--probe", is_flag=True, help="Send harmless requests to see which devices answer.")
 @click.option(
     "--driver",

@@ -50,7 +50,7 @@ def test_everything_on_the_bus_is_read_back_and_nothing_is_taken_from_others(
     sender = threading.Thread(target=send)
     sender.start()
     try:
-        assert exit_status(command, ["--raw", name, "-n", "6", "-T", "60"]) == 0
+        assert exit_status(command, ["--raw", name, "-n", "6", "--timeout", "60"]) == 0
         batch = FrameBatch(100_000, 64)
 
         def heard() -> bool:

@@ -91,7 +91,7 @@ def test_a_missing_file_is_wrong_usage(line: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "line",
     [
-        "skin-config torzo versions -T 0.1",
+        "skin-config torzo versions --timeout 0.1",
         "skin-dump torzo -n 1",
         "skin-info torzo",
         "skin-info torzo --health",

@@ -79,7 +79,7 @@ def test_options_come_from_the_command_line_and_a_file(capsys: pytest.CaptureFix
     assert "8: type mtb4" in text
     assert "9: no answer" in text
     assert "7:" not in text
-    assert "7: type" in configured(capsys, VIRTUAL, "versions", "--config", str(path), "-o", "boards=7")
+    assert "7: type" in configured(capsys, VIRTUAL, "versions", "--config", str(path), "--option", "boards=7")
 
 
 def test_a_person_is_asked_before_anything_is_changed(capsys: pytest.CaptureFixture[str], person: list[bool]) -> None:
@@ -148,8 +148,8 @@ def test_a_driver_that_starts_while_a_person_thinks_is_noticed(
         ([VIRTUAL, "rate", "hz=50", "pace=3", "--yes"], 2, "it takes: bus, patch, hz"),
         ([VIRTUAL, "rate", "hz=0", "--yes"], 2, "3.93 to 1000 Hz"),
         ([VIRTUAL, "versions", "--driver", "robskin"], 2, "did you mean 'roboskin'"),
-        ([VIRTUAL, "versions", "-o", "boards"], 2, "KEY=VALUE"),
-        ([VIRTUAL, "versions", "-o", "board=7"], 2, "did you mean 'boards'"),
+        ([VIRTUAL, "versions", "--option", "boards"], 2, "KEY=VALUE"),
+        ([VIRTUAL, "versions", "--option", "board=7"], 2, "did you mean 'boards'"),
         (["virtual?boards=7&streaming=yes", "rebaseline", "--yes"], 2, "another program may be using the bus"),
         (["torso", "versions"], 1, "no driver 'torso' runs in namespace"),
         ([VIRTUAL, "versions", "--config", "/no/such.toml"], 2, "/no/such.toml"),

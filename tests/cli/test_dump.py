@@ -137,8 +137,8 @@ def test_without_a_name_the_living_one_is_taken(capsys: pytest.CaptureFixture[st
     [
         ([], 1, "no driver in namespace"),
         (["nobody"], 1, "no service 'nobody'"),
-        (["nobody", "-T", "0.01"], 1, "no service 'nobody'"),
-        (["-T", "0.01"], 1, "start one: skin-driver --bus virtual"),
+        (["nobody", "--timeout", "0.01"], 1, "no service 'nobody'"),
+        (["--timeout", "0.01"], 1, "start one: skin-driver --bus virtual"),
         (["a/b"], 2, "service name 'a/b'"),
         (["-n", "0"], 2, "-n"),
         (["--rate", "0", "here"], 2, "rate of 0.0 Hz"),
@@ -161,7 +161,7 @@ def test_mistakes(arguments: list[str], status: int, words: str, capsys: pytest.
     assert "Traceback" not in printed.err
 
 
-@pytest.mark.parametrize("arguments", [["-T", "60"], ["late", "-T", "60"]])
+@pytest.mark.parametrize("arguments", [["--timeout", "60"], ["late", "--timeout", "60"]])
 def test_waits_for_the_driver_to_appear(
     arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -184,7 +184,7 @@ def test_waits_for_the_driver_to_appear(
 def test_silence_fails_after_the_timeout(more: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with FakeSkin("a") as skin:
         skin.publish()
-        assert exit_status(command, ["a", "-T", "0.05", *more]) == 1
+        assert exit_status(command, ["a", "--timeout", "0.05", *more]) == 1
         printed = capsys.readouterr()
         assert printed.out.count("\n") == 1
         assert printed.err == (
@@ -192,7 +192,7 @@ def test_silence_fails_after_the_timeout(more: list[str], capsys: pytest.Capture
         )
     with fake_process("b") as process:
         kill(process)
-        assert exit_status(command, ["b", "-T", "0.05", *more]) == 1
+        assert exit_status(command, ["b", "--timeout", "0.05", *more]) == 1
         assert "its writer is dead" in capsys.readouterr().err
 
 

@@ -139,7 +139,7 @@ def test_frames_of_drivers_are_dumped_as_before(capsys: pytest.CaptureFixture[st
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
-        (["--raw", "virtual", "-T", "0.05"], 1, "virtual: no frame for 0.05 s"),
+        (["--raw", "virtual", "--timeout", "0.05"], 1, "virtual: no frame for 0.05 s"),
         (["--raw", "no-such-can0"], 1, "CAN"),
         (["--raw", "/dev/ttyUSB0"], 2, "a serial line has one owner"),
         (["--raw", "serial:/dev/ttyUSB0"], 2, "a serial line has one owner"),

@@ -207,7 +207,9 @@ def test_a_driver_and_those_that_look_at_it(
             )
             check("`status`, `stopped` of a calmed driver", status, calm.stop())
         check("`skin-wipe`", *wiping())
-        check("`skin-config`", *printing(config, "roboskin"), *printing(config, "roboskin", "versions", "-T", "60"))
+        check(
+            "`skin-config`", *printing(config, "roboskin"), *printing(config, "roboskin", "versions", "--timeout", "60")
+        )
         status = driver.wait_for("status")
         check("`status`, `stopped`", status, driver.stop())
 
@@ -240,10 +242,10 @@ def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, mo
     tty = SerialPort("/dev/ttyUSB0", "ftdi_sio", usb, ("/dev/skin/A5",), False, "dialout", False, (User(1, "init"),))
     monkeypatch.setattr(interfaces, "can_interfaces", lambda: [can0])
     monkeypatch.setattr(ports, "serial_ports", lambda: [tty])
-    machine = printing(find, "--probe", "--listen", "0.1")
+    machine = printing(find, "--probe", "--seconds", "0.1")
     monkeypatch.setattr(interfaces, "can_interfaces", list)
-    heard = printing(find, f"{VIRTUAL}&streaming=yes", "--probe", "--listen", "1")
-    no_interface = printing(find, "--listen", "0.1")
+    heard = printing(find, f"{VIRTUAL}&streaming=yes", "--probe", "--seconds", "1")
+    no_interface = printing(find, "--seconds", "0.1")
     # what is heard on an interface of the kernel, and who has it, is told as it is for other buses
     owner = {"name": "a", "namespace": "b", "driver_type": "c", "pid": 1, "buses": ["can0"]}
     machine[0]["can"]["interfaces"][0] |= {**heard[0]["buses"][0], "used_by": owner}

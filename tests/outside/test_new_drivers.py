@@ -34,7 +34,7 @@ def check(stranger: Stranger, package: Path, *, at_least: int) -> None:
 
 def frame_of(stranger: Stranger, driver: str) -> dict[str, list[float]]:
     """The first frame in which everything is fresh."""
-    for line in stranger.do("skin-dump", driver, "-n", "50", "-T", "50", "--json").splitlines():
+    for line in stranger.do("skin-dump", driver, "-n", "50", "--timeout", "50", "--json").splitlines():
         frame: dict[str, list[float]] = json.loads(line)
         if not any(frame["status"]):
             return frame

@@ -182,7 +182,9 @@ def looked_at(program: Path) -> dict[str, Any]:
     told: dict[str, Any] = {f"c {name}": run_c(program, "describe", name) for name in ("torso", "arm", "pose")}
     told["skin-info"] = json.loads(run("skin-info", "--json").stdout)
     told["skin-top"] = json.loads(run("skin-top", "--json", "-T", "0.1").stdout.splitlines()[0])
-    told["skin-dump"] = json.loads(run("skin-dump", "torso", "-n", "1", "-T", "1", "--json").stdout.splitlines()[0])
+    told["skin-dump"] = json.loads(
+        run("skin-dump", "torso", "-n", "1", "--timeout", "1", "--json").stdout.splitlines()[0]
+    )
     with DriverReader("torso") as reader:
         told["structure"] = (reader.structure, reader.driver_type, reader.schema)
         told["counters"] = reader.bus_counters(reader.read()), reader.patch_counters(reader.read())

@@ -453,7 +453,16 @@ def test_a_map_is_written_of_one_message(domain: int, tmp_path: Path) -> None:
     definitions.mkdir(parents=True)
     (definitions / "Hand.msg").write_text("std_msgs/Header header\nFinger[<=5] fingers\nfloat64[6] palm\nbool dummy\n")
     path = tmp_path / "map.toml"
-    asking = ("skin-config", f"dds://{domain}", "write_map", "--driver", "ros2", "-o", "topic=/hand", f"file={path}")
+    asking = (
+        "skin-config",
+        f"dds://{domain}",
+        "write_map",
+        "--driver",
+        "ros2",
+        "--option",
+        "topic=/hand",
+        f"file={path}",
+    )
     with published(domain, _HAND, "rt/hand") as program:
         failed = refused(*asking, f"definitions={tmp_path}")
         assert "my_msgs/msg/Finger.msg" in failed.stderr
@@ -470,7 +479,7 @@ def test_the_commands(domain: int, tmp_path: Path) -> None:
     """Emulated topics are found, read, captured and replayed."""
     with running("skin-emulate", "--driver", "ros2", "--bus", f"dds://{domain}", "--message", "points") as emulated:
         emulated.wait_for("ready")
-        [bus] = json.loads(run("skin-find", f"dds://{domain}", "--listen", "3", "--json").stdout)["buses"]
+        [bus] = json.loads(run("skin-find", f"dds://{domain}", "--seconds", "3", "--json").stdout)["buses"]
         [topic] = [each for each in bus["topics"] if each["publishers"]]
         assert (topic["topic"], topic["drivers"]) == ("rt/touch", ["ros2"])
         capture = f"{tmp_path}/touch.mcap"

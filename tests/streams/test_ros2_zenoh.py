@@ -172,7 +172,7 @@ def test_samples_that_are_lost_or_wrong_are_counted(at: Router) -> None:
 def test_topics_are_found(at: Router) -> None:
     with published(at, case_of("sensor_msgs/msg/PointCloud2"), "/cloud", 6):
         bus_name = f"ros2://6?router={at.endpoint}"
-        [bus] = json.loads(run("skin-find", bus_name, "--listen", "3", "--json").stdout)["buses"]
+        [bus] = json.loads(run("skin-find", bus_name, "--seconds", "3", "--json").stdout)["buses"]
         [topic] = bus["topics"]
         assert (topic["topic"], topic["publishers"], topic["drivers"]) == ("rt/cloud", 1, ["ros2"])
 

@@ -13,7 +13,8 @@ question of TACT is data; the answer about another property has bit 7 of the pro
   set, and the values of these ten cells in ascending order, four bits each, in N/cm2. The other cells are weaker;
   they are published as 0.
 
-The number of TACT depends on the firmware; 106 is counted from the list in CANbus.cc for the firmware that has it.
+TACT is property 106 in firmware from 142 on; older firmware has none (``property_list.cpp`` in
+BarrettTechnology/libbarrett 109faf6, 2018-07-18).
 """
 
 from __future__ import annotations

@@ -65,6 +65,10 @@ def test_the_emulated_hand_byte_for_byte() -> None:
         assert answer[99:] == bytes([cycle]) * 15 + bytes(15) + bytes([cycle]) * 15
     assert hand.answers(bytes.fromhex("00040105")) == [bytes.fromhex("003001") + b"\2" * 15 + bytes(15) + b"\2" * 15]
     assert hand.answers(ZERO) == []
+    [answer] = hand.answers(bytes.fromhex("0009010102030405 06"))
+    assert len(answer) == 3 + 96 + 45 + 4
+    [answer] = hand.answers(bytes.fromhex("00070101020304"))
+    assert len(answer) == 3 + 96
 
 
 @pytest.mark.parametrize(

@@ -282,7 +282,7 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
             if not self.options.old:
                 about += bytes([_TIPS[self.options.tips].kind, self.options.fitted])
             return struct.pack(">H", 2 + len(about)) + about
-        if command[2] == 1 and 5 in command[3:]:
+        if command[2] == 1 and not {1, 5}.isdisjoint(command[3:]):
             device.memory["asked"] = command[3:]
             self.burst(device, now_ns)
             return b""
@@ -300,11 +300,13 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
         if 1 in device.memory["asked"]:
             body += b"".join(struct.pack(">BhhhB", motor + 1, 10 * motor, -motor, 305, 0) for motor in range(motors))
         sent, tips = iter(values), _TIPS[self.options.tips]
-        for finger in range(_MOTORS_AND_FINGERS[self.options.hand][1]):
+        for finger in range(_MOTORS_AND_FINGERS[self.options.hand][1] if 5 in device.memory["asked"] else 0):
             if finger in self._fitted:
                 body += struct.pack(tips.form, *[next(sent) for _ in range(tips.n_values)])
             elif self.options.pads:
                 body += bytes(struct.calcsize(tips.form))
+        if 6 in device.memory["asked"]:
+            body += bytes(4)
         return [struct.pack(">HB", len(body) + 3, 1) + body]
 
     @property

@@ -189,8 +189,10 @@ class Memory:
         self._greatest[key] = greatest, time_ns
         return rounded_up(max(greatest, _LEAST_SPAN * noise))
 
-    def limits(self, key: tuple[str, str], values: Floats) -> tuple[float, float]:
-        """Return the extremes of (k,) values seen so far."""
+    def limits(self, key: tuple[str, str], values: Floats, known: tuple[float, float]) -> tuple[float, float]:
+        """Return the two limits of values where they are known, otherwise the extremes of (k,) values seen so far."""
+        if all(map(math.isfinite, known)):
+            return known
         counting = values[np.isfinite(values)]
         low, high = self._extremes.get(key, (math.inf, -math.inf))
         low, high = min(low, float(counting.min(initial=math.inf))), max(high, float(counting.max(initial=-math.inf)))

@@ -228,7 +228,7 @@ class Look:
         if is_force:
             span = memory.span((name, self.mode), values, memory.rest.noise(name), newest.frame.published_ns)
             return 0.0, min(span, known[1])
-        return memory.limits((name, self.mode), values)
+        return memory.limits((name, self.mode), values, known)
 
     def _distances(
         self, newest: Newest, quantity: Quantity, memory: Memory, fresh: npt.NDArray[np.bool_]

@@ -235,7 +235,7 @@ def test_figures_of_contacts_and_regions_do_not_wrap(page: Page, server: FakeSer
         for name in ("palm", "the whole of the left forearm")
     ]
     until(page, "skin.contacts.length === 2")
-    assert "12346 counts" in page.locator("#contacts").inner_text()
+    until(page, "document.querySelector('#contacts').innerText.includes('12346 counts')")
     assert "12346\t" in page.locator("#regions").inner_text()
     assert "counts" in page.locator("#regions thead").inner_text()
     until(page, "document.querySelectorAll('#contacts tbody tr').length === 2")
@@ -251,6 +251,7 @@ def test_contacts_and_shear_are_drawn(page: Page, server: FakeServer, driver: Fa
     place = {"position": driver.position[20].tolist(), "normal": [0.0, 0.0, 1.0], "taxels": 9}
     driver.contacts = [contact | place]
     until(page, "skin.contacts.length === 1 && skin.contacts[0].id === 12")
+    until(page, "document.querySelector('#contacts').innerText.includes('load, counts')")
     assert "load, counts\tmm/s\ts" in page.locator("#contacts").inner_text()
     assert "12\thold\t31.5\t0\t2" in page.locator("#contacts").inner_text()
     page.wait_for_timeout(200)

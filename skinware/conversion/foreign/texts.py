@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from skinware.conversion.foreign.source import DUMP, ColumnSource, Rows
 from skinware.errors import ConfigurationError
+from skinware.realtime import NS_PER_S
 
 _READ_BYTES = 1 << 20
 _SAMPLE_LINES = 200
@@ -151,7 +152,7 @@ class TextSource(ColumnSource):
     # -- rows -----------------------------------------------------------------------------------------------------
 
     def _rows(self, lines: list[str], first: int, names: Collection[str]) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-        whole = [name for name in names if name in self._exact | self.times]
+        whole = [name for name in names if name in {*self._exact, *self.times}]
         texts = [name for name in names if name in self.left_out]
         floats = [name for name in names if name not in (*whole, *texts)]
         places = [self._places[name] for name in floats]
@@ -265,5 +266,5 @@ def _date_ns(cell: str) -> np.int64:
     if not str(date).startswith(cell[:4]):
         raise ValueError
     zone = found[3] if found[3] not in (None, "Z") else "+00:00"
-    ahead = np.timedelta64(int(zone[:3]) * 60 + int(zone[0] + zone[-2:]), "m")
-    return np.int64((date - ahead).astype(np.int64))
+    ahead_ns = (int(zone[:3]) * 60 + int(zone[0] + zone[-2:])) * 60 * NS_PER_S
+    return np.int64(int(date.astype(np.int64)) - ahead_ns)

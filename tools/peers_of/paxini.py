@@ -50,7 +50,8 @@ def compare(comparison: Comparison, name: str, read: Any, *options: str) -> None
     frames = messages(bytes(heard))
     decoded = [(frame, decode_stream(known(name), frame, strict=False)) for frame in frames]
     whole = iter([(frame, shown.values.tolist()) for frame, shown in decoded if not shown.never_seen.any()])
-    ours = [next((each for each in whole if each[1] == values), (b"", [])) for values in theirs]  # it may miss some
+    missing: tuple[bytes, list[int]] = (b"", [])
+    ours = [next((each for each in whole if each[1] == values), missing) for values in theirs]  # it may miss some
     comparison.agree(f"{name}: {SAMPLES} times {len(theirs[0])} values", [values for _, values in ours], theirs)
     nth = int(np.argmax([len(set(values)) for values in theirs[: SAMPLES - KEPT]]))
     kept = [frame.hex() for frame, _ in ours[nth : nth + KEPT]]

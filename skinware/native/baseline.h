@@ -51,6 +51,9 @@
 #define SLOW_S 5.0            /* seconds: deviations that last longer are drift of the taxel, quicker ones are noise */
 #define NOISE_S 60.0f         /* seconds: time constant of the noise, which changes with temperature and motors */
 #define FEWEST 0.1f           /* weight of one frame in the noise, at most */
+#define FIRST_DRIFT 1e-4      /* times the variance of noise, a second: drift of its own, before a patch showed it */
+#define LEAST_DRIFT 1e-6      /* with less, it takes minutes until a drift that begins is believed */
+#define MOST_DRIFT 1e-1       /* with more, noise is followed */
 #define TICK_S 1.0            /* seconds between adjustments of what changes slowly */
 
 /* Contacts */

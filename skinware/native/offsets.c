@@ -215,8 +215,8 @@ static void tick(struct baseline *b, double passed_s) {
         const double beyond = p->sums[BEYOND] / fmax(p->sums[NUMBER], 1);
         if (p->sums[NUMBER] > 0) {
             p->noise2 = p->sums[TYPICAL];
-            p->drift *= exp(b->tick_s / 10 * (2 * beyond - 1));
-            p->drift = fmin(fmax(p->drift, 1e-9 * p->noise2), 1e-1 * p->noise2);
+            p->drift = p->drift > 0 ? p->drift * exp(b->tick_s / 10 * (2 * beyond - 1)) : FIRST_DRIFT * p->noise2;
+            p->drift = fmin(fmax(p->drift, LEAST_DRIFT * p->noise2), MOST_DRIFT * p->noise2);
         }
         p->sums[0] = p->sums[1] = 0;
     }

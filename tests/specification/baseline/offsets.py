@@ -18,10 +18,13 @@ from tests.specification.baseline.numbers import (
     DRIFT_SIGMA,
     FEW_TAXELS,
     FEWEST,
+    FIRST_DRIFT,
     GAIN_LASTS_S,
     GAIN_SPREAD2,
+    LEAST_DRIFT,
     LEAST_GAIN,
     MATCH_S,
+    MOST_DRIFT,
     MOST_GAIN,
     NOISE_S,
     RATE_S,
@@ -258,7 +261,8 @@ class Offsets:
         some = self.patches.sum(taxels) > 0
         np.copyto(self.typical, typical, where=some)
         agility = self.agility * np.exp(self._tick_s / 10 * (2 * beyond - 1))
-        np.copyto(self.agility, np.clip(agility, 1e-9 * typical, 1e-1 * typical), where=some)
+        agility = np.where(self.agility > 0, agility, FIRST_DRIFT * typical)
+        np.copyto(self.agility, np.clip(agility, LEAST_DRIFT * typical, MOST_DRIFT * typical), where=some)
         self._grows[:] = self.patches.spread(self.agility)
         forgets = np.where(taxels, np.float32(-math.expm1(-self._tick_s / GAIN_LASTS_S)), np.float32(0))
         self.gain += (1 - self.gain) * forgets

@@ -140,10 +140,11 @@ static void show(struct baseline *b, float *to) {
     int64_t number, i;
     for (number = 0; number < b->n_runs; number++) {
         const struct run *run = &b->runs[number];
-        const float common = (float)b->patches[run->patch].variance;
+        const float common = (float)b->patches[run->patch].variance, wander = (float)b->patches[run->patch].wander;
         INDEPENDENT
-        for (i = run->first; i < run->last; i++) {
-            const float variance = a.variance[i] + a.gain[i] * a.gain[i] * common;
+        for (i = run->first; i < run->last; i++) { /* no taxel is surer than it, or a typical one, was right at rest */
+            const float least = highest(wander, a.slow[i] * a.slow[i]) + a.strayed2[i];
+            const float variance = highest(a.variance[i], least) + a.gain[i] * a.gain[i] * common;
             baseline[i] = a.level[i] + a.left[i];
             uncertainty[i] = a.ready[i] ? sqrtf(variance) : NAN;
             noise[i] = sqrtf(a.noise2[i]);

@@ -52,8 +52,9 @@
 #define NOISE_S 60.0f         /* seconds: time constant of the noise, which changes with temperature and motors */
 #define FEWEST 0.1f           /* weight of one frame in the noise, at most */
 #define FIRST_DRIFT 1e-4      /* times the variance of noise, a second: drift of its own, before a patch showed it */
-#define LEAST_DRIFT 1e-6      /* with less, it takes minutes until a drift that begins is believed */
-#define MOST_DRIFT 1e-1       /* with more, noise is followed */
+#define LEAST_DRIFT 1e-6      /* the same, at least: from less, it takes minutes until a new drift is believed */
+#define MOST_DRIFT 1e-1       /* the same, at most: with more, noise is followed */
+#define WANDER_S 10.0         /* seconds over which errors of offsets at rest, and speeds of own drift, are averaged */
 #define TICK_S 1.0            /* seconds between adjustments of what changes slowly */
 
 /* Contacts */
@@ -88,8 +89,10 @@ struct patch {
     double rate2;     /* its mean square */
     double unknown_s; /* how long too few taxels have been free to say how it moves */
     double known_s;
+    double own_rate2; /* mean square of the speeds at which its taxels drift by themselves */
     double noise2;    /* of a typical taxel */
     double drift;     /* variance that the offset of a taxel gains in a second by a drift of its own */
+    double wander;    /* square of how far a typical taxel at rest is from its offset, over some seconds */
     double largest;   /* load of a touch, now or a moment ago */
     double since_s;   /* the last touch */
     double share;     /* of a load that its cover keeps */
@@ -107,6 +110,8 @@ struct module {
     double near;    /* 1: something touches it */
     double looked;  /* a touch on it is looked at: touches.c has when */
     double median, onset, slow, on, off, number, alike; /* of a module that is looked at */
+    double living, speed2; /* number of its taxels with values, sum of the squares of their speeds */
+    double rate2;          /* mean square of the speeds at which its taxels drift by themselves */
 };
 
 struct baseline {
@@ -132,6 +137,8 @@ struct baseline {
     float *level, *gain, *variance, *cross, *gain_variance, *noise2; /* offset, its gain, and how uncertain both are */
     float *noise_s;                             /* for how long the noise has been measured */
     float *slow;                                /* deviation at rest, over some seconds */
+    float *own_rate2;                           /* rate2 of its module */
+    float *speed, *unseen_s, *strayed2;         /* of its own drift; since it was measured, and how far it led, squared */
     float *gain_before;                         /* gain at the last tick */
     float *last, *away_s;                       /* newest value, and time since */
     float *smooth, *peak, *contact_s;           /* deviation, smoothed; highest load and age of a touch */

@@ -188,13 +188,48 @@ void follow_common(struct baseline *b, double passed_s) {
     }
 }
 
-enum { BEYOND = 1, TYPICAL }; /* beside NUMBER */
+enum { BEYOND = 1, TYPICAL, AWAY, SPEED2 = 1 }; /* beside NUMBER */
+
+/* Learns how quickly the taxels of each module drift by themselves, as they did when they were last seen at rest. */
+static void follow_speeds(struct baseline *b) {
+    const double share = passed_share(b->tick_s, WANDER_S);
+    int64_t i;
+    for (i = 0; i < b->n_modules; i++)
+        b->modules[i].living = b->modules[i].speed2 = 0;
+    for (i = 0; i < b->n_patches; i++)
+        b->patches[i].sums[NUMBER] = b->patches[i].sums[SPEED2] = 0;
+    for (i = 0; i < b->n; i++) {
+        struct module *m = &b->modules[b->module[i]];
+        struct patch *p = &b->patches[b->patch[i]];
+        const double speed2 = (double)(b->speed[i] * b->speed[i]);
+        if (!b->live[i])
+            continue;
+        m->living += 1, m->speed2 += speed2;
+        p->sums[NUMBER] += 1, p->sums[SPEED2] += speed2;
+    }
+    for (i = 0; i < b->n_patches; i++) {
+        struct patch *p = &b->patches[i];
+        if (p->sums[NUMBER] > FEW_TAXELS)
+            p->own_rate2 = p->sums[SPEED2] / p->sums[NUMBER];
+    }
+    for (i = 0; i < b->n; i++)
+        if (b->modules[b->module[i]].living <= FEW_TAXELS)
+            b->modules[b->module[i]].speed2 = b->patches[b->patch[i]].own_rate2;
+    for (i = 0; i < b->n_modules; i++) {
+        struct module *m = &b->modules[i];
+        const double rate2 = m->living > FEW_TAXELS ? m->speed2 / m->living : m->speed2;
+        m->rate2 += (rate2 - m->rate2) * share;
+    }
+    for (i = 0; i < b->n; i++)
+        b->own_rate2[i] = (float)b->modules[b->module[i]].rate2;
+}
 
 /* Adjusts what changes slowly: the drift of taxels by themselves, and the typical gain of a patch, which is 1. */
 static void tick(struct baseline *b, double passed_s) {
     const double slowly = passed_share(passed_s, SLOW_S);
     const float share = (float)(slowly / (2 - slowly));
     const float forgets = (float)passed_share(b->tick_s, GAIN_LASTS_S);
+    const int64_t stride = sizeof(struct patch) / sizeof(double);
     int64_t number, i;
     for (number = 0; number < b->n_patches; number++)
         for (i = 0; i < 4; i++)
@@ -208,13 +243,17 @@ static void tick(struct baseline *b, double passed_s) {
         p->sums[NUMBER] += 1;
         p->sums[BEYOND] += b->slow[i] * b->slow[i] > expected;
     }
-    medians(b, b->patch, b->n_patches, b->noise2, b->flag, &b->patches->sums[TYPICAL],
-            sizeof(struct patch) / sizeof(double));
+    medians(b, b->patch, b->n_patches, b->noise2, b->flag, &b->patches->sums[TYPICAL], stride);
+    for (i = 0; i < b->n; i++)
+        b->scratch[b->n + i] = fabsf(b->slow[i]);
+    medians(b, b->patch, b->n_patches, b->scratch + b->n, b->flag, &b->patches->sums[AWAY], stride);
     for (number = 0; number < b->n_patches; number++) {
         struct patch *p = &b->patches[number];
         const double beyond = p->sums[BEYOND] / fmax(p->sums[NUMBER], 1);
         if (p->sums[NUMBER] > 0) {
+            const double away2 = p->sums[AWAY] * p->sums[AWAY] / MEDIAN2 - p->sums[TYPICAL] * (double)share;
             p->noise2 = p->sums[TYPICAL];
+            p->wander += (fmax(away2, 0) - p->wander) * passed_share(b->tick_s, WANDER_S);
             p->drift = p->drift > 0 ? p->drift * exp(b->tick_s / 10 * (2 * beyond - 1)) : FIRST_DRIFT * p->noise2;
             p->drift = fmin(fmax(p->drift, LEAST_DRIFT * p->noise2), MOST_DRIFT * p->noise2);
         }
@@ -235,6 +274,7 @@ static void tick(struct baseline *b, double passed_s) {
         b->gain[i] = lowest(highest(b->gain[i], LEAST_GAIN), MOST_GAIN);
         b->gain_before[i] = b->gain[i];
     }
+    follow_speeds(b);
 }
 
 /*
@@ -246,6 +286,7 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
     const double slowly_ = passed_share(passed_s, SLOW_S);
     const float slowly = (float)slowly_, of_noise = (float)(slowly_ / (2 - slowly_));
     const float floor = (float)fmin(passed_s / b->tau_s, 0.5), quick = (float)fmin(passed_s / RESETTLE_S, 0.5);
+    const float averages = (float)passed_share(passed_s, WANDER_S);
     const float passed = (float)passed_s, other_side = b->is_signed ? -1.0f : 1.0f;
     const float beside_s = (float)fmax(b->settle_s, 1e-6);
     int64_t number, i;
@@ -287,6 +328,11 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
             a.cross[i] = cross * keep;
             a.variance[i] = keep * keep * variance + share * share * (is_measured ? noise2 : 0.0f);
             a.slow[i] = slower;
+            const float unseen_s = is_measured ? 0.0f : a.unseen_s[i] + passed;
+            const float strays = is_measured ? 0.0f : a.own_rate2[i] * passed * (2 * a.unseen_s[i] + passed);
+            a.strayed2[i] = keep * keep * a.strayed2[i] + strays;
+            a.unseen_s[i] = unseen_s;
+            a.speed[i] += (share * innovation / passed - a.speed[i]) * (is_measured & (a.used[i] <= 0) ? averages : 0.0f);
             a.noise2[i] = noise2 + (away * (innovation - slower) - noise2) * (is_calm ? of_square : 0.0f);
             a.noise_s[i] = known_s;
         }

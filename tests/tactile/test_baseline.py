@@ -676,3 +676,29 @@ def test_a_hand_that_slams_shut_after_a_sag_of_the_supply_is_a_touch() -> None:
     shares = list[float]()
     bench.run(5, load=40.0, each=lambda calm: shares.append(float(calm.touched.mean())))
     assert min(shares[4:]) == 1
+
+
+def test_offsets_are_as_uncertain_as_they_are_wrong_while_taxels_drift_by_themselves() -> None:
+    """Taxels begin to drift after 20 s, each at a speed of its own, as where a hand warms them; a grip of 2 minutes."""
+    random = np.random.default_rng(3)
+    module, speed = np.repeat(np.arange(4), 12), 0.003 * random.standard_normal(48)
+    load = np.where(np.arange(48) % 12 < 6, 20.0, 0.0) * (module < 2)
+    baseline = Baseline(module, np.zeros(48, int), resolution=0.0)
+    held, free, doubts, errors = [], [], [], []
+    for number in range(20 * 180):
+        time_s = number / 20
+        offset = 100 + speed * max(time_s - 20, 0)
+        is_held = load * (time_s >= 60)
+        calm = baseline.update(number * 50_000_000, offset + is_held + 0.1 * random.standard_normal(48))
+        error = calm.baseline - offset
+        is_right = np.abs(error) < 2 * np.hypot(calm.uncertainty, calm.noise)
+        if time_s > 62:
+            assert calm.touched[load > 0].all()
+            held.append(is_right[load > 0])
+            doubts.append(calm.uncertainty[load > 0])
+            errors.append(error[load > 0])
+        if time_s > 10:
+            free.append(is_right[load == 0])
+    assert np.mean(free) > 0.93
+    assert np.mean(held) > 0.85
+    assert np.mean(np.square(doubts)) < 4 * np.mean(np.square(errors))

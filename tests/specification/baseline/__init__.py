@@ -129,7 +129,7 @@ class SpecifiedBaseline:
         self._resolution, self._limits = resolution, limits
         self._intake = _Intake(n, resolution)
         self._ready: Flags = np.zeros(n, bool)
-        self._offsets = Offsets(patch)
+        self._offsets = Offsets(patch, module)
         self._rest = Rest(self._offsets.patches, self._least_noise2)
         self._touches = Touches(module, patch, signed=signed)
         self._surroundings = Surroundings(module, patch)
@@ -261,7 +261,7 @@ class SpecifiedBaseline:
             learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
             learns &= ~self._surroundings.beside | (np.abs(touches.smooth) < rustle)
             calm = learns & (np.abs(touches.smooth) < rustle)
-            offsets.learn(deviation, learns, calm, floor, passed_s)
+            offsets.learn(deviation, learns, calm, touches.remainders.used <= 0, live, floor, passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
         if not touches.signed:
             touches.remainders.follow(deviation, touches.smooth, touches.touched, on, passed_s)

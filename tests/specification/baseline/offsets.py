@@ -30,6 +30,7 @@ from tests.specification.baseline.numbers import (
     RATE_S,
     SLOW_S,
     TICK_S,
+    WANDER_S,
 )
 
 Floats = npt.NDArray[np.float32]
@@ -136,6 +137,7 @@ class Offsets:
 
     Args:
         patch: (n,) int, the patch of each taxel: its taxels drift together.
+        module: (n,) int, the module of each taxel: what drifts by itself does so there.
 
     Attributes:
         level: (n,) float32, the offset; NaN before it is known.
@@ -148,10 +150,12 @@ class Offsets:
         slow: (n,) float32, the deviation of each at rest, over some seconds.
         common: the common modes.
         agility: (n_patches,) variance that the offset of a taxel gains in a second by a drift of its own.
+        wander: (n_patches,) square of how far a typical taxel at rest is from its offset, over some seconds.
+        rate2: (n_modules,) mean square of the speeds at which taxels drift by themselves, a second.
         typical: (n_patches,) noise2 of a typical taxel: a dead one, without noise, says no more of the common mode.
     """
 
-    def __init__(self, patch: Rows) -> None:
+    def __init__(self, patch: Rows, module: Rows) -> None:
         n = len(patch)
         self.level: Floats = np.full(n, np.nan, np.float32)
         self.gain: Floats = np.ones(n, np.float32)
@@ -161,7 +165,15 @@ class Offsets:
         self.noise_s: Floats = np.full(n, NOISE_S, np.float32)
         self.patches = Grouping(patch)
         self.common = CommonMode(self.patches.n)
-        self.agility, self.typical = np.zeros((2, self.patches.n))
+        self.agility, self.typical, self.wander, self._speed2 = np.zeros((4, self.patches.n))
+        self._modules = Grouping(module)
+        self.rate2 = np.zeros(self._modules.n)
+        self._patch_of_module = np.zeros(self._modules.n, np.intp)
+        self._patch_of_module[module] = patch
+        self._speed: Floats = np.zeros(n, np.float32)
+        """Of the drift of each by itself, a second."""
+        self._unseen_s, self._strayed2 = np.zeros((2, n), np.float32)
+        """For how long nothing has been measured of each, and the square of how far its own drift led meanwhile."""
         self._gain_before: Floats = self.gain.copy()
         self._grows: Floats = np.zeros(n, np.float32)
         """Variance that each offset gains in a second by a drift of its own."""
@@ -175,8 +187,9 @@ class Offsets:
 
     def uncertainty(self) -> Floats:
         """Return (n,) the standard deviation of the offset."""
+        least = np.maximum(self.patches.spread(self.wander), self.slow * self.slow) + self._strayed2
         common = self.patches.spread(self.common.variance)
-        deviation: Floats = np.sqrt(self.variance + self.gain * self.gain * common)
+        deviation: Floats = np.sqrt(np.maximum(self.variance, least) + self.gain * self.gain * common)
         return deviation
 
     def follow_common(self, deviation: Floats, free: Flags, hidden2: Floats, passed_s: float) -> None:
@@ -209,13 +222,24 @@ class Offsets:
         self.variance += moved * (np.float32(2) * self.cross + doubt)
         self.cross += doubt
 
-    def learn(self, deviation: Floats, taxels: Flags, calm: Flags, floor: Floats | np.float32, passed_s: float) -> None:
+    def learn(
+        self,
+        deviation: Floats,
+        taxels: Flags,
+        calm: Flags,
+        fresh: Flags,
+        live: Flags,
+        floor: Floats | np.float32,
+        passed_s: float,
+    ) -> None:
         """Correct offsets and gains by the deviations of taxels at rest; let the others become less certain.
 
         Args:
             deviation: (n,) of the values from the offsets.
             taxels: (n,) which are measured.
             calm: (n,) those of them that are far from a touch: only they say something of gains and noise.
+            fresh: (n,) those that have not got used to a load: only they say something of the speed of drift.
+            live: (n,) those with values and offsets.
             floor: least share of a deviation that the offset follows where it drifts by itself.
             passed_s: since the last frame.
         """
@@ -241,6 +265,12 @@ class Offsets:
         self.variance = keep * keep * self.variance + share * share * np.where(taxels, self.noise2, np.float32(0))
         quick = innovation - self.slow
         self.slow += quick * (np.float32(slowly) * taxels)
+        passed = np.float32(passed_s)
+        strays = self._modules.spread(self.rate2) * passed * (2 * self._unseen_s + passed)
+        self._strayed2 = keep * keep * self._strayed2 + np.where(taxels, np.float32(0), strays)
+        self._unseen_s = np.where(taxels, np.float32(0), self._unseen_s + passed)
+        averages = np.float32(-math.expm1(-passed_s / WANDER_S))
+        self._speed += (share * innovation / np.float32(passed_s) - self._speed) * (averages * (taxels & fresh))
         quick2 = quick * (innovation - self.slow)
         self.noise_s = np.minimum(self.noise_s + calm * np.float32(passed_s), np.float32(NOISE_S))
         with np.errstate(divide="ignore"):
@@ -248,18 +278,22 @@ class Offsets:
         self.noise2 += (quick2 - self.noise2) * (calm * of_square)
         self._tick_s += passed_s
         if self._tick_s >= TICK_S:
-            self._tick(taxels, passed_s)
+            self._tick(taxels, live, passed_s)
             self._tick_s = 0.0
 
-    def _tick(self, taxels: Flags, passed_s: float) -> None:
+    def _tick(self, taxels: Flags, live: Flags, passed_s: float) -> None:
         """Adjust what changes slowly: the agility of own drift, and the typical gain of a patch, which is 1."""
         number = np.maximum(self.patches.sum(taxels), 1)
         share = -math.expm1(-passed_s / SLOW_S)
-        expected = np.float32(1.5 * _MEDIAN) * (self.noise2 * np.float32(share / (2 - share)) + self.uncertainty() ** 2)
+        of_noise = np.float32(share / (2 - share))
+        expected = np.float32(1.5 * _MEDIAN) * (self.total() - self.noise2 * (1 - of_noise))
         beyond = self.patches.sum(taxels & (self.slow * self.slow > expected)) / number
         typical = self.patches.median(self.noise2, taxels).astype(np.float64)
         some = self.patches.sum(taxels) > 0
         np.copyto(self.typical, typical, where=some)
+        away = self.patches.median(np.abs(self.slow), taxels).astype(np.float64)
+        away2 = np.maximum(away * away / _MEDIAN - typical * of_noise, 0)
+        self.wander += (away2 - self.wander) * (some * -math.expm1(-self._tick_s / WANDER_S))
         agility = self.agility * np.exp(self._tick_s / 10 * (2 * beyond - 1))
         agility = np.where(self.agility > 0, agility, FIRST_DRIFT * typical)
         np.copyto(self.agility, np.clip(agility, LEAST_DRIFT * typical, MOST_DRIFT * typical), where=some)
@@ -274,6 +308,17 @@ class Offsets:
         self.gain *= np.where(taxels, ratio, np.float32(1))  # they and the mode must not float apart
         np.clip(self.gain, LEAST_GAIN, MOST_GAIN, out=self.gain)
         self._gain_before = self.gain.copy()
+        self._follow_speeds(live)
+
+    def _follow_speeds(self, taxels: Flags) -> None:
+        """Learn how quickly the taxels of each module drift by themselves, as they did when they were last at rest."""
+        speed2 = np.where(taxels, self._speed * self._speed, np.float32(0))
+        number = self.patches.sum(taxels)
+        np.copyto(self._speed2, self.patches.sum(speed2) / np.maximum(number, 1), where=number > FEW_TAXELS)
+        number = self._modules.sum(taxels)
+        found = self._modules.sum(speed2) / np.maximum(number, 1)
+        found = np.where(number > FEW_TAXELS, found, self._speed2[self._patch_of_module])
+        self.rate2 += (found - self.rate2) * -math.expm1(-self._tick_s / WANDER_S)
 
     def begin(self, taxels: Rows, level: Floats, noise2: Floats, gain: Floats, gain_variance: Floats) -> None:
         """Give k taxels what was measured of them: levels, noise and gains (k,)."""

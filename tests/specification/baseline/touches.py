@@ -52,7 +52,7 @@ class Touches:
         self.touched: Flags = np.zeros(n, bool)
         self._high: Flags = np.zeros(n, bool)
         self.smooth, self.peak, self.contact_s, self.onset = (np.zeros(n, np.float32) for _ in range(4))
-        self._modules, self._patch = Grouping(module), patch
+        self._modules = Grouping(module)
         self.noise_share = 0.5
         self.remainders = Remainders(self._modules, patch)
 
@@ -107,8 +107,7 @@ class Touches:
         peak = self.peak[active]
         rises, eases = (np.float32(-math.expm1(-passed_s / constant_s)) for constant_s in (PEAK_S, USED_S))
         self.peak[active] = peak + (load - peak) * np.where(load > peak, rises, eases)
-        variance = offsets.variance[active] + offsets.noise2[active] + (0.3 * self.remainders.left[active]) ** 2
-        variance += offsets.gain[active] ** 2 * offsets.common.variance[self._patch[active]].astype(np.float32)
+        variance = offsets.total()[active] + (0.3 * self.remainders.left[active]) ** 2
         is_over = load < off[active]
         is_over |= (load < FALLEN * self.peak[active]) & (load * load < DRIFT_SIGMA**2 * variance)
         fades = self.remainders.fade(active, load, off[active], passed_s)

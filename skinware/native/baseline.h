@@ -144,7 +144,7 @@ struct baseline {
     float *smooth, *peak, *contact_s;           /* deviation, smoothed; highest load and age of a touch */
     float *settling_s;                          /* time for which it is still held */
     float *onset;                               /* deviation in the first frame above the threshold of the end */
-    float *below_s, *down_s, *sunk, *dip, *dip_s;
+    float *below_s, *down_s, *lowered, *sunk, *dip, *dip_s;
     float *used, *left, *steady, *used_then, *since_fall_s, *noted, *since_end_s;
     float *first; /* value in the first frame of the measurement */
 
@@ -153,7 +153,7 @@ struct baseline {
     uint8_t *live, *at_end, *low, *flag;
     uint8_t *bears; /* the vector of which this is an axis bears a load */
 
-    uint8_t *ready, *seen, *touched, *high, *felt, *before, *below, *sagging, *returned, *held, *forced;
+    uint8_t *ready, *seen, *touched, *high, *felt, *below, *sagging, *returned, *held, *forced;
 
     float *blocks; /* (BLOCKS, 6, n): frames, deviations d from the first value, modes c, d * d, d * c and c * c */
     int64_t *list; /* taxels that are touched */

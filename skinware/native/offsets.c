@@ -44,7 +44,8 @@ static void step_mode(struct patch *p, double passed_s) {
     p->rate2 += (p->rate * p->rate - p->rate2) * (passed_s / fmin(fmax(p->known_s, RATE_S), 10 * RATE_S));
 }
 
-/* Which taxels are at rest, and what they say of the mode: a taxel near a contact may bear a load that is no touch. */
+/* Which taxels are at rest, and what they say of the mode: a taxel near a contact may bear a load that is no touch; the
+ * fall of one whose own offset was wrong says nothing. */
 static void sum_run(struct baseline *b, const struct run *run, struct patch *p) {
     const struct baseline a = *b; /* no store can change it */
     const float common = (float)p->variance, typical = (float)p->noise2, low = -(float)b->off_sigma;
@@ -59,7 +60,7 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
     }
     INDEPENDENT
     for (i = first; i < last; i++)
-        a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1);
+        a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1) & !(a.lowered[i] > 0);
     INDEPENDENT
     for (i = first; i < last; i++) {
         const float on = a.on[i], hidden2 = a.held[i] ? on * on : 0.0f;
@@ -296,7 +297,9 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
         const int64_t first = run->first, last = run->last;
         INDEPENDENT
         for (i = first; i < last; i++) {
-            const float load = highest(a.deviation[i], a.deviation[i] * other_side), since_s = a.since_end_s[i];
+            const float load = highest(a.deviation[i], a.deviation[i] * other_side);
+            const int is_low = !a.is_signed & (a.smooth[i] < -a.off[i]); /* no touch leaves less than 0 */
+            const float since_s = is_low ? SETTLED_S : a.since_end_s[i];
             a.flag[i] = (load < a.on[i] ? since_s : 0.0f) >= SETTLED_S;
         }
         INDEPENDENT

@@ -78,25 +78,28 @@ static void find_low(struct baseline *b, float rustle_share, double passed_s) {
     }
 }
 
-/* Follows taxels that are below their offsets: those that sink while something touches their patch come back. */
+/*
+ * Finds the taxels that are below their offsets since something touches their patch: the cover pulls them down, and they
+ * come back. A cover would be back soon after the touch; those that are as low then were so before.
+ */
 static void find_sagging(struct baseline *b, float passed) {
     const struct baseline a = *b; /* no store can change it */
-    int64_t i, k, is_any_busy = 0;
-    for (k = 0; k < b->n_patches; k++)
-        is_any_busy |= is_busy(b, k);
+    int64_t i, k;
     for (k = 0; k < b->n_runs; k++) {
         const int64_t first = b->runs[k].first, last = b->runs[k].last;
         const int busy = is_busy(b, b->runs[k].patch);
+        const int is_back = (float)b->patches[b->runs[k].patch].since_s > SAG_RETURNS_S;
         INDEPENDENT
         for (i = first; i < last; i++) {
-            const float longer_s = a.down_s[i] + passed, down_s = a.below[i] ? longer_s : 0.0f;
-            const int is_long = down_s > SAG_RETURNS_S, was_down = (busy & a.before[i] & a.below[i]) | (!busy & is_long);
+            const float depth = -a.smooth[i], longer_s = a.down_s[i] + passed;
+            const float down_s = depth > a.off[i] ? longer_s : 0.0f, before = a.below[i] ? a.lowered[i] : 0.0f;
+            const float lowered = (is_back & (down_s > SAG_RETURNS_S)) ? depth : before;
+            const int sags = busy & a.below[i] & !((lowered > 0) & (depth <= lowered + a.off[i]));
             a.down_s[i] = down_s;
-            a.before[i] = (uint8_t)was_down;
-            a.sagging[i] = (uint8_t)(busy & a.below[i] & !was_down);
+            a.lowered[i] = lowered;
+            a.sagging[i] = (uint8_t)sags;
+            a.sunk[i] = is_back ? 0.0f : highest(a.sunk[i], sags ? depth : 0.0f);
         }
-        for (i = first; is_any_busy && i < last; i++)
-            a.sunk[i] = busy ? highest(a.sunk[i], a.sagging[i] ? -a.smooth[i] : 0) : 0.0f;
     }
 }
 
@@ -104,9 +107,10 @@ static void find_sagging(struct baseline *b, float passed) {
 static void recover(struct baseline *b, int64_t i, float passed) {
     const float depth = -b->smooth[i];
     b->below_s[i] += passed;
-    if (b->below_s[i] < (float)fmax(b->recover_s, 1e-9) || depth <= SAG_SHARE * (float)b->patches[b->patch[i]].largest)
+    if (b->lowered[i] <= 0 && (b->below_s[i] < (float)fmax(b->recover_s, 1e-9) ||
+                               depth <= SAG_SHARE * (float)b->patches[b->patch[i]].largest))
         return;
-    b->below_s[i] = b->dip_s[i] = 0;
+    b->below_s[i] = b->dip_s[i] = b->lowered[i] = 0;
     b->dip[i] = depth;
     if (!b->is_held)
         put(b, i, b->smooth[i]);
@@ -121,7 +125,7 @@ void follow_falls(struct baseline *b, float rustle_share, double passed_s) {
     find_sagging(b, (float)passed_s);
     for (i = 0; i < b->n; i++) {
         a.low[i] = a.live[i] & (a.smooth[i] < -a.on[i]);
-        if (a.low[i])
+        if (a.low[i] || a.lowered[i] > 0)
             recover(b, i, (float)passed_s);
         else
             a.below_s[i] = 0;

@@ -88,3 +88,31 @@ def test_a_cover_that_pulls_a_whole_quiet_patch_down_is_no_drift() -> None:
         calm = baseline.update(sample.time_ns, sample.values, sample.usable)
     assert not calm.touched.any()
     assert np.abs(calm.baseline - sample.values.astype(np.float32)).max() <= 2
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_presses_that_follow_each_other_quickly_stay_felt(seed: int) -> None:
+    """A patch is pressed for 1.75 s by what slides away, then free for 0.65 s, again and again: it is always in use."""
+    random, surface = np.random.default_rng(seed), grid(1, 8, 8)
+    place_m, rate_hz, noise = surface.position_m[:, :2], 100, 4.0
+    pitch_m = np.ptp(place_m) / 7
+    times_s = np.arange(60 * rate_hz) / rate_hz
+    load = np.zeros((len(times_s), len(place_m)))
+    for begin_s in np.arange(7, 58, 2.4):
+        centre_m = random.uniform(place_m.min(axis=0), place_m.max(axis=0))
+        way, width_m = random.normal(size=2), random.uniform(1, 2) * pitch_m
+        top = random.uniform(270, 1350)
+        rows = np.flatnonzero((times_s >= begin_s) & (times_s < begin_s + 1.75))
+        share = (times_s[rows] - begin_s) / 1.75
+        slid_m = 2 * pitch_m * np.clip(5 * share - 4, 0, 1)[:, None] * way / np.hypot(*way)
+        away2 = ((place_m - (centre_m + slid_m)[:, None]) ** 2).sum(axis=2)
+        load[rows] = top * np.minimum(1, share * 58)[:, None] * np.exp(-away2 / 2 / width_m**2)
+    values = np.round(1000 + load + random.normal(0, noise, load.shape)).astype(np.float32)
+    baseline, touched = Baseline(surface.module, surface.patch), np.zeros(load.shape, bool)
+    for number, row in enumerate(values):
+        touched[number] = baseline.update(1_000_000_000 + round(times_s[number] * 1e9), row).touched
+    pressed = load > 15 * noise
+    pressed[20:] &= pressed[:-20]  # for 0.2 s, at least
+    pressed[: 9 * rate_hz] = False
+    assert (~touched & pressed).sum() < 0.05 * pressed.sum()
+    assert (touched & (load < 1)).sum() < 0.005 * (load < 1).sum()

@@ -240,7 +240,7 @@ class SpecifiedBaseline:
         free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end()
         if not touches.signed:
             low = touches.smooth < -settings.off_sigma * spread
-            free &= ~self._falls.sagging & ~(self._falls.below & low)
+            free &= ~self._falls.sagging & ~(self._falls.below & low) & (self._falls.lowered <= 0)
         offsets.follow_common(deviation, free, np.where(self._surroundings.held, on * on, np.float32(0)), passed_s)
         touches.follow(deviation, live, on, passed_s, settings.smooth_s)
         rustle = np.float32(touches.noise_share) * off
@@ -251,13 +251,16 @@ class SpecifiedBaseline:
         self._surroundings.hold(touches, live, passed_s, settings.settle_s)
         if not touches.signed:
             moves = offsets.common.agility * passed_s > offsets.typical
-            self._falls.sag(touches.smooth, rustle, live & ~touches.touched, offsets.patches, moves, passed_s)
+            self._falls.sag(touches.smooth, off, rustle, live & ~touches.touched, offsets.patches, moves, passed_s)
         low = self._recover(deviation, live, on, passed_s)
         if not self._all_held:
             floor: Floats | np.float32 = np.float32(min(passed_s / settings.tau_s, 0.5))
             quick = np.float32(min(passed_s / RESETTLE_S, 0.5))
             floor = np.where(touches.remainders.used > 0, quick, floor)
-            learns = live & ~touches.touched & ~self._falls.sagging & touches.remainders.has_settled
+            settled = touches.remainders.has_settled
+            if not touches.signed:
+                settled |= touches.smooth < -off  # no touch leaves less than 0
+            learns = live & ~touches.touched & ~self._falls.sagging & settled
             learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
             learns &= ~self._surroundings.beside | (np.abs(touches.smooth) < rustle)
             calm = learns & (np.abs(touches.smooth) < rustle)

@@ -25,6 +25,7 @@ class Surroundings:
         module, patch: as given.
         n_modules: number of modules.
         busy: (n,) bool, something touches the patch, or did a moment ago: its cover may sag.
+        is_back: (n,) bool, nothing touches the patch, and its cover has had the time to come back.
         held: (n,) bool, the taxels that are near a contact, or were in the last ``settle_s``.
         beside: (n,) bool, those of them that are near one now.
         largest: (n_patches,) the largest load of each patch.
@@ -35,6 +36,7 @@ class Surroundings:
         self.n_modules = int(module.max(initial=-1)) + 1
         self.largest: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
         self.busy: Flags = np.zeros(len(module), bool)
+        self.is_back: Flags = np.ones(len(module), bool)
         self.held: Flags = np.zeros(len(module), bool)
         self.beside: Flags = np.zeros(len(module), bool)
         self._since_s = np.full(len(self.largest), np.inf)
@@ -55,6 +57,7 @@ class Surroundings:
             np.maximum.at(self.largest, patch, touches.smooth[active])
             self._settling_s[self._near(active)] = max(settle_s, 1e-6)
         self.busy = (self._since_s <= settle_s)[self.patch]
+        self.is_back = (self._since_s.astype(np.float32) > np.float32(SAG_RETURNS_S))[self.patch]
         self.held = self._settling_s > 0
         self.beside = self._settling_s >= np.float32(max(settle_s, 1e-6))
 
@@ -77,6 +80,7 @@ class Falls:
     Attributes:
         below: (n,) bool, it is below its offset, and most of its patch is not.
         sagging: (n,) bool, it has sunk since something touches its patch: it comes back, and says nothing of drift.
+        lowered: (n,) float32, how far it was below while no cover could pull it down; 0: it was not.
         returned: (n,) uint8, how often each returned to where it had fallen from: touches may lower it.
     """
 
@@ -88,6 +92,7 @@ class Falls:
         """How long ago each module was touched by what is no new touch."""
         self._sunk: Floats = np.zeros(n, np.float32)
         """How far each has sagged since something touches its patch."""
+        self.lowered: Floats = np.zeros(n, np.float32)
         self._felt: Flags = np.zeros(n, bool)
         """Which have ever risen under a touch: their polarity is right."""
         self._dip: Floats = np.zeros(n, np.float32)
@@ -95,18 +100,24 @@ class Falls:
         self._dip_s: Floats = np.zeros(n, np.float32)
         self.returned: npt.NDArray[np.uint8] = np.zeros(n, np.uint8)
         self._down_s: Floats = np.zeros(n, np.float32)
-        """How long each has been below."""
-        self._before: Flags = np.zeros(n, bool)
-        """Which were below before anything touched their patch."""
+        """How long each has been far below."""
         self.below: Flags = np.zeros(n, bool)
         self.sagging: Flags = np.zeros(n, bool)
 
     def sag(
-        self, smooth: Floats, rustle: Floats, rests: Flags, patches: Grouping, moves: Flags, passed_s: float
+        self,
+        smooth: Floats,
+        off: Floats,
+        rustle: Floats,
+        rests: Flags,
+        patches: Grouping,
+        moves: Flags,
+        passed_s: float,
     ) -> None:
         """Find the taxels at rest that are below their offsets by more than noise, unless most of their patch is.
 
-        While a patch is touched, most of it may sag, unless its mode ``moves`` (n_patches,) by more than noise.
+        While a patch is touched, most of it may sag, unless its mode ``moves`` (n_patches,) by more than noise. A cover
+        would be back soon after the touch: those that are as low then, farther than ``off``, were so before.
         """
         below = rests & (smooth < np.where(self.below, np.float32(0), -rustle))
         if below.any():
@@ -115,25 +126,21 @@ class Falls:
             if common.any():
                 below &= ~common[self._around.patch]
         self.below = below
-        self._down_s = np.where(below, self._down_s + np.float32(passed_s), np.float32(0))
-        self._before = np.where(self._around.busy, self._before, self._down_s > SAG_RETURNS_S)
-        if self._around.busy.any():
-            self._before &= below | ~self._around.busy
-            self.sagging = below & self._around.busy & ~self._before
-            self._sunk = np.where(self._around.busy, np.maximum(self._sunk, -smooth * self.sagging), np.float32(0))
-        elif self.sagging.any():
-            self.sagging = np.zeros_like(below)
+        depth = -smooth
+        self._down_s = np.where(depth > off, self._down_s + np.float32(passed_s), np.float32(0))
+        was_down = (self._down_s > SAG_RETURNS_S) & self._around.is_back
+        self.lowered = np.where(was_down, depth, np.where(below, self.lowered, np.float32(0)))
+        self.sagging = below & self._around.busy & ~((self.lowered > 0) & (depth <= self.lowered + off))
+        self._sunk = np.where(self._around.is_back, np.float32(0), np.maximum(self._sunk, depth * self.sagging))
 
     def recovered(self, low: Flags, smooth: Floats, passed_s: float, after_s: float) -> Rows:
-        """Return the taxels that have been far below their offsets for ``after_s``, and do not sag."""
-        if not low.any():
-            self._below_s[:] = 0
-            return np.zeros(0, np.intp)
+        """Return the taxels that are far below their offsets for ``after_s``, or below while no cover pulls."""
         self._below_s = np.where(low, self._below_s + np.float32(passed_s), np.float32(0))
         due = self._below_s >= max(after_s, 1e-9)
         if self._around.largest.any():
             due &= -smooth > SAG_SHARE * self._around.largest[self._around.patch]
-        self._below_s[due] = 0
+        due |= self.lowered > 0
+        self._below_s[due] = self.lowered[due] = 0
         self._dip[due], self._dip_s[due] = -smooth[due], 0
         return np.flatnonzero(due)
 

@@ -51,7 +51,7 @@ class DriverRest:
     def __init__(self, structure: Structure) -> None:
         self._structure = structure
         growing = [t.id for t in structure.types if t.name in _GROW_WHEN_TOUCHED]
-        self._fall_s = np.where(np.isin(structure.sensor_type, growing), _FALL_S, _DRIFT_S).astype(np.float32)
+        self._grows: npt.NDArray[np.bool_] = np.isin(structure.sensor_type, growing)
         self.begin()
 
     def begin(self) -> None:
@@ -77,17 +77,20 @@ class DriverRest:
         """
         if not self.is_due(time_ns):
             return
-        passed_s = np.float32(0 if self._time_ns is None else min(1.0, max(0, time_ns - self._time_ns) / 1e9))
+        passed_s = 0.0 if self._time_ns is None else min(1.0, max(0, time_ns - self._time_ns) / 1e9)
         self._time_ns = time_ns
         counts = fresh & np.isfinite(physical)
         self.baseline = np.where(counts & np.isnan(self.baseline), physical, self.baseline)
         change = np.where(counts, physical - self.baseline, np.float32(0))
         settling = self._age_s < SETTLING_S
         np.maximum(self._unrest, np.where(settling, np.abs(change), 0), out=self._unrest)
-        slow_s = np.where(change < 0, self._fall_s, np.float32(_DRIFT_S))
-        self._age_s += passed_s * counts
-        follow_s = np.where(settling, self._age_s, slow_s)
-        self.baseline += change * (passed_s / np.maximum(follow_s + passed_s, np.float32(1e-9)))
+        falls, drifts = (np.float32(-np.expm1(-passed_s / duration_s)) for duration_s in (_FALL_S, _DRIFT_S))
+        share = np.where((change < 0) & self._grows, falls, drifts)
+        self._age_s += np.float32(passed_s) * counts
+        if settling.any():
+            first = np.float32(passed_s) / np.maximum(self._age_s + np.float32(passed_s), np.float32(1e-9))
+            share = np.where(settling, first, share)
+        self.baseline += change * share
         self._every_ns = 0 if (settling & counts).any() else _FOLLOW_EVERY_NS
 
     def change(self, physical: Floats) -> Floats:

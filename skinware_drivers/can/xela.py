@@ -1,9 +1,9 @@
-"""XELA uSkin and a CPM finger with CySkin technology on CAN.
+"""XELA uSkin on CAN: three-axis taxels, one frame for each.
 
-uSkin: three-axis taxels, one frame for each. Wire format: ur-o2as ``o2as_xela_sensor.py`` (a 4x4 sensor;
-github.com/o2ac/ur-o2as) and uskin_can_drivers ``src/can_communication.cpp`` (a 4x6 sensor;
-github.com/ARQ-CRISP/uskin_can_drivers). 1 Mbit/s. Start: identifier ``0x200 | board``, ``07 00``; stop: ``07 01``.
-Data: eight bytes, byte 0 unused, then X, Y and Z as big-endian uint16, byte 7 unused.
+Wire format: ur-o2as ``o2as_xela_sensor.py`` (a 4x4 sensor; github.com/o2ac/ur-o2as) and uskin_can_drivers
+``src/can_communication.cpp`` (a 4x6 sensor; github.com/ARQ-CRISP/uskin_can_drivers). 1 Mbit/s. Start: identifier
+``0x200 | board``, ``07 00``; stop: ``07 01``. Data: eight bytes, byte 0 unused, then X, Y and Z as big-endian uint16,
+byte 7 unused.
 
 The identifiers of the taxels depend on the model. Both published schemes are implemented:
 
@@ -12,14 +12,6 @@ The identifiers of the taxels depend on the model. Both published schemes are im
 
 A message is not always a new sample: in a recording of 506 messages a second, taxels keep their values over many
 messages, and the wire does not show which. It carries no checksum and no sequence number, and no command is answered.
-
-CPM finger: sixteen taxels in four frames. Wire format: can2wifi2ros ``arduino_can2wifi/arduino_can2wifi.ino``
-(github.com/wngfra/can2wifi2ros, Apache-2.0). 1 Mbit/s. Identifiers 0x405, 0x407, 0x409, 0x40B in this order, eight
-bytes each: four little-endian uint16. The i-th value of a set belongs to taxel ``ORDER[i]``, as in the other programs
-of that author; one of his calibration scripts reads the table the other way round. The finger sends by itself: no
-program of that author sends a command.
-
-The frames carry no number and no checksum, so one lost frame loses its set, and sets are separated by time alone.
 """
 
 from __future__ import annotations
@@ -32,7 +24,7 @@ from msgspec import Meta
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.sensor_types import PRESSURE, SHEAR_X, SHEAR_Y
-from skinware_drivers import Bits, Cycle, Frame, Identifier, Layout, Link, Module, Options, Patch, Values, taxels
+from skinware_drivers import Bits, Frame, Identifier, Layout, Link, Module, Options, Patch, Values, taxels
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.hand import Grid, Place
 
@@ -127,28 +119,3 @@ class XelaDriver(CanAdapter[XelaOptions]):
         """Send the start command to a silent board, which may have lost its power: it answers no question."""
         await link.send(0x200 | patch.key, b"\x07\x00")
         return False
-
-
-ORDER = (11, 15, 14, 12, 9, 13, 8, 10, 6, 7, 4, 5, 2, 0, 3, 1)
-IDENTIFIERS = (0x405, 0x407, 0x409, 0x40B)
-QUARTERS = tuple(
-    Frame(f"{identifier:03X}", (Identifier(identifier),), (8,), Values(0, "<u2", 4, to=ORDER[4 * i : 4 * i + 4]))
-    for i, identifier in enumerate(IDENTIFIERS)
-)
-
-
-class CyskinCpmOptions(Options, frozen=True):
-    period_ms: Annotated[int, Meta(description="nominal time between two sets, ms", ge=1)] = 20
-
-
-class CyskinCpmDriver(CanAdapter[CyskinCpmOptions]):
-    """One finger on each bus; uid = taxel. Values are raw counts, without a baseline."""
-
-    types = (PRESSURE.measured(unit="counts", minimum=0, maximum=0xFFFF),)
-    dtype = np.uint16
-    patches = (Patch("finger", [Module(taxels(16), kind="fingertip")]),)
-
-    def __init__(self, options: CyskinCpmOptions) -> None:
-        super().__init__(options)
-        names = tuple(frame.name for frame in QUARTERS)
-        self.layout = Layout(QUARTERS, Cycle(names, within="patch", maximum_age_s=self.period_s / 2))

@@ -15,21 +15,24 @@ import pytest
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver, AllegroV5UdpDriver
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
+from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
-from skinware_drivers.can.xela import CyskinCpmDriver, XelaDriver
+from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.modbus.dfrobot import DfrobotDriver
 from skinware_drivers.modbus.inspire import InspireDriver
 from skinware_drivers.modbus.revo2 import Revo2Driver
 from skinware_drivers.modbus.revo3 import Revo3Driver
 from skinware_drivers.serial.ability_hand import AbilityHandDriver
 from skinware_drivers.serial.agni import AgniDriver
-from skinware_drivers.serial.boards import AnySkinDriver, SkintalkDriver, TactileGloveDriver
+from skinware_drivers.serial.anyskin import AnySkinDriver
 from skinware_drivers.serial.contactile import Dev001Driver, PapillArrayDriver
 from skinware_drivers.serial.flexitac import FlexiTacDriver
 from skinware_drivers.serial.openpatch import OpenPatchDriver
 from skinware_drivers.serial.paxini import PaxiniDriver
 from skinware_drivers.serial.robotiq_tsf import RobotiqTsfDriver
+from skinware_drivers.serial.skintalk import SkintalkDriver
+from skinware_drivers.serial.tactile_glove import TactileGloveDriver
 from skinware_drivers.serial.weiss import WeissDsaDriver, WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.streams.dex3 import Dex3Driver

@@ -15,15 +15,10 @@ import pytest
 
 from skinware import DriverReader, DriverSnapshot, PatchState, Status
 from skinware.status import BusState
-from skinware_drivers.serial.boards import (
-    AnySkinDriver,
-    AnySkinOptions,
-    SkintalkDriver,
-    SkintalkOptions,
-    TactileGloveDriver,
-    TactileGloveOptions,
-)
+from skinware_drivers.serial.anyskin import AnySkinDriver, AnySkinOptions
 from skinware_drivers.serial.bus import SerialBus
+from skinware_drivers.serial.skintalk import SkintalkDriver, SkintalkOptions
+from skinware_drivers.serial.tactile_glove import TactileGloveDriver, TactileGloveOptions
 from skinware_drivers.testing.driving import EmulatedSkin, driving_lines
 from skinware_drivers.virtual.devices.boards import (
     EmulatedAnySkin,

@@ -12,7 +12,8 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.barrett import BarrettDriver, BarrettOptions
-from skinware_drivers.can.xela import CyskinCpmDriver, CyskinCpmOptions, XelaDriver, XelaOptions
+from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver, CyskinCpmOptions
+from skinware_drivers.can.xela import XelaDriver, XelaOptions
 from skinware_drivers.description import assemble
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.bus import VirtualCanBus

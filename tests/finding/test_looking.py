@@ -15,10 +15,11 @@ from skinware_drivers.can import roboskin_setup
 from skinware_drivers.can.allegro_v5 import AllegroV5Driver
 from skinware_drivers.can.barrett import BarrettDriver
 from skinware_drivers.can.canopen_patch import CanopenDriver
+from skinware_drivers.can.cyskin_cpm import CyskinCpmDriver
 from skinware_drivers.can.linkerhand import LinkerHandDriver
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_layout import RoboskinOptions
-from skinware_drivers.can.xela import CyskinCpmDriver, XelaDriver
+from skinware_drivers.can.xela import XelaDriver
 from skinware_drivers.finding import looking
 from skinware_drivers.finding.looking import HeardOnBus, ProbeAnswer, ask, ask_port, listen
 from skinware_drivers.finding.without_driver import attended

@@ -14,7 +14,7 @@ import pytest
 
 from skinware_drivers.can.linkerhand import LinkerHandDriver, LinkerHandOptions
 from skinware_drivers.serial.ability_hand import AbilityHandDriver, AbilityHandOptions
-from skinware_drivers.serial.boards import AnySkinDriver, AnySkinOptions
+from skinware_drivers.serial.anyskin import AnySkinDriver, AnySkinOptions
 from skinware_drivers.testing.vectors import decode_frames, decode_stream
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
 from tests.peers.paxini_boards import known

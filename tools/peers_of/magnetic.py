@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from comparing import Comparison, emulated, tapped
 
-from skinware_drivers.serial.boards import AnySkinDriver, AnySkinOptions
+from skinware_drivers.serial.anyskin import AnySkinDriver, AnySkinOptions
 from skinware_drivers.testing.vectors import decode_stream
 
 MAGNETOMETERS, SAMPLES = 5, 400

@@ -61,7 +61,7 @@ module = [
 
 
 class Closing(NamedTuple):
-    """What a closing took.
+    """The times of a closing, stage by stage.
 
     Attributes:
         stages_ms: (stages,) durations.

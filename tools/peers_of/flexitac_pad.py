@@ -18,7 +18,7 @@ FRAME = len(MARKER) + ROWS * COLUMNS
 
 
 def ours(stream: bytes) -> list[list[int]]:
-    """What our driver shows after each frame; it first listens to an emulated pad of the same size."""
+    """Return what our driver shows after each frame; it first listens to an emulated pad of the same size."""
     driver, like = FlexiTacDriver(FlexiTacOptions()), EmulatedFlexiTacOptions(rows=ROWS, columns=COLUMNS)
     decode_stream(driver, b"", strict=False, devices=EmulatedFlexiTac(like))
     ends = range(FRAME + len(MARKER), len(stream), FRAME)

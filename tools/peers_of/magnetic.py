@@ -31,7 +31,7 @@ def read(library: str, port: str) -> list[list[float]]:
 
 
 def ours(stream: bytes) -> list[list[float]]:
-    """What our driver shows after each message; one is taken when the next one ends as it must, too."""
+    """Return what our driver shows after each message; one is taken when the next one ends as it must, too."""
     driver = AnySkinDriver(AnySkinOptions(mags=MAGNETOMETERS))
     shown = [
         decode_stream(driver, stream[at : at + 2 * MESSAGE], strict=False)

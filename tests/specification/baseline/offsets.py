@@ -171,7 +171,7 @@ class Offsets:
         self._patch_of_module = np.zeros(self._modules.n, np.intp)
         self._patch_of_module[module] = patch
         self._speed: Floats = np.zeros(n, np.float32)
-        """Of the drift of each by itself, a second."""
+        """How quickly each drifts by itself, a second."""
         self._unseen_s, self._strayed2 = np.zeros((2, n), np.float32)
         """For how long nothing has been measured of each, and the square of how far its own drift led meanwhile."""
         self._gain_before: Floats = self.gain.copy()

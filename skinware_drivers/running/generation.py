@@ -275,7 +275,7 @@ class Flow:
         self._handed = []
         for line in self._lines:
             source = self._sources[len(self._handed)]
-            source.stream = source.asker = None
+            source.stream = source.asker = source.can = None
             if isinstance(line.bus, KernelBus) and line.bus.hand_over(self._batch, source):
                 source.bus = line.ordinal
                 source.heard_ns = line.condition.heard_ns

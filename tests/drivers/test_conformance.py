@@ -41,32 +41,29 @@ from skinware_drivers.streams.ros2 import Ros2Driver
 from skinware_drivers.streams.tesollo import TesolloDriver
 from skinware_drivers.streams.xela_server import XelaServerDriver
 from skinware_drivers.streams.yarp import YarpDriver
-from skinware_drivers.virtual.devices.boards import (
-    EmulatedAgni,
-    EmulatedAnySkin,
-    EmulatedCyskinCpm,
-    EmulatedFlexiTac,
-    EmulatedRobotiqTsf,
-    EmulatedSkintalk,
-)
+from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
+from skinware_drivers.virtual.devices.agni import EmulatedAgni
+from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5, EmulatedAllegroV5Tips, EmulatedAllegroV5Udp
+from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin
+from skinware_drivers.virtual.devices.barrett import EmulatedBarrett
 from skinware_drivers.virtual.devices.canopen_patch import EmulatedCanopen
 from skinware_drivers.virtual.devices.contactile import EmulatedDev001, EmulatedPapillArray
-from skinware_drivers.virtual.devices.gloves import EmulatedTactileGlove, EmulatedWujiGlove
-from skinware_drivers.virtual.devices.hands import (
-    EmulatedAbilityHand,
-    EmulatedAllegroV5,
-    EmulatedAllegroV5Tips,
-    EmulatedAllegroV5Udp,
-    EmulatedBarrett,
-    EmulatedTesollo,
-)
+from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm
+from skinware_drivers.virtual.devices.dds import EmulatedDex3, EmulatedRos2
+from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
+from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
-from skinware_drivers.virtual.devices.networks import EmulatedDex3, EmulatedIcubEth, EmulatedRos2, EmulatedYarp
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.registers import EmulatedDfrobot, EmulatedInspire, EmulatedRevo2, EmulatedRevo3
+from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf
+from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk
+from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove
+from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
 from skinware_drivers.virtual.devices.weiss import EmulatedWeissDsa, EmulatedWeissWts
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaServer
+from skinware_drivers.virtual.devices.yarp import EmulatedYarp
 from skinware_drivers.virtual.hardware import EventLog
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions

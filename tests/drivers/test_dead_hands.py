@@ -13,15 +13,12 @@ from skinware_drivers.polling import ZeroWatch
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from skinware_drivers.virtual import Emulator
-from skinware_drivers.virtual.devices.boards import EmulatedFlexiTac
-from skinware_drivers.virtual.devices.hands import (
-    EmulatedAbilityHand,
-    EmulatedAllegroV5,
-    EmulatedAllegroV5Tips,
-    EmulatedTesollo,
-)
+from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand
+from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5, EmulatedAllegroV5Tips
+from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
+from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo
 from skinware_drivers.virtual.devices.weiss import EmulatedWeissDsa
 from skinware_drivers.virtual.devices.xela import EmulatedXelaServer
 

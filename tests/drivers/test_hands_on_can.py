@@ -24,7 +24,7 @@ from skinware_drivers.fields import Match
 from skinware_drivers.link import Link
 from skinware_drivers.registry import NamedBus, load_driver
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.devices.hands import EmulatedAllegroV5Tips
+from skinware_drivers.virtual.devices.allegro_v5 import EmulatedAllegroV5Tips
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand
 from tests.drivers.bench import Bench, BenchLoop, Case, play
 from tests.drivers.frame_fuzzing import fuzz

@@ -20,13 +20,9 @@ from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.skintalk import SkintalkDriver, SkintalkOptions
 from skinware_drivers.serial.tactile_glove import TactileGloveDriver, TactileGloveOptions
 from skinware_drivers.testing.driving import EmulatedSkin, driving_lines
-from skinware_drivers.virtual.devices.boards import (
-    EmulatedAnySkin,
-    EmulatedAnySkinOptions,
-    EmulatedSkintalk,
-    EmulatedSkintalkOptions,
-)
-from skinware_drivers.virtual.devices.gloves import EmulatedTactileGlove, EmulatedTactileGloveOptions
+from skinware_drivers.virtual.devices.anyskin import EmulatedAnySkin, EmulatedAnySkinOptions
+from skinware_drivers.virtual.devices.skintalk import EmulatedSkintalk, EmulatedSkintalkOptions
+from skinware_drivers.virtual.devices.tactile_glove import EmulatedTactileGlove, EmulatedTactileGloveOptions
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.lines import line
 

@@ -17,11 +17,11 @@ from skinware_drivers.finding.guess import known_drivers
 from skinware_drivers.finding.looking import ProbeAnswer, ask_port, can_ask
 from skinware_drivers.finding.ports import SerialPort
 from skinware_drivers.testing.driving import emulated_on_a_pty
-from skinware_drivers.virtual.devices.boards import EmulatedAgni
-from skinware_drivers.virtual.devices.gloves import EmulatedWujiGlove
+from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.openpatch import EmulatedOpenPatch
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.weiss import EmulatedWeissDsa, EmulatedWeissWts
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
 from tests.finding.fakes import see_only
 from tests.serial.lines import Line, line, opened
 

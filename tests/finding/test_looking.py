@@ -25,13 +25,13 @@ from skinware_drivers.finding.looking import HeardOnBus, ProbeAnswer, ask, ask_p
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.link import Link
 from skinware_drivers.virtual.bus import VirtualCanBus
-from skinware_drivers.virtual.devices.boards import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
-from skinware_drivers.virtual.devices.hands import (
+from skinware_drivers.virtual.devices.allegro_v5 import (
     EmulatedAllegroV5,
     EmulatedAllegroV5Options,
     EmulatedAllegroV5Tips,
     EmulatedAllegroV5TipsOptions,
 )
+from skinware_drivers.virtual.devices.cyskin_cpm import EmulatedCyskinCpm, EmulatedCyskinCpmOptions
 from skinware_drivers.virtual.devices.linkerhand import EmulatedLinkerHand, EmulatedLinkerHandOptions
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.hardware import EmulatedHardware, Event

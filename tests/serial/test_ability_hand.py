@@ -13,7 +13,7 @@ from skinware_drivers.serial.ability_hand import AbilityHandDriver, AbilityHandO
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.devices.hands import EmulatedAbilityHand, EmulatedAbilityHandOptions, message
+from skinware_drivers.virtual.devices.ability_hand import EmulatedAbilityHand, EmulatedAbilityHandOptions, message
 from tests.sdk.driving import driving_lines, read_until
 from tests.serial.lines import line
 from tests.serial.spoken import Spoken

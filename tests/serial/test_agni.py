@@ -13,7 +13,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.agni import AgniDriver, AgniOptions, command
 from skinware_drivers.testing.driving import emulated_skin
-from skinware_drivers.virtual.devices.boards import EmulatedAgni, EmulatedAgniOptions, message
+from skinware_drivers.virtual.devices.agni import EmulatedAgni, EmulatedAgniOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
 

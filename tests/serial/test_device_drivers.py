@@ -17,12 +17,12 @@ from skinware_drivers.serial.weiss import WeissWtsDriver
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.driving import emulated_on_a_pty
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.devices.boards import EmulatedAgni
-from skinware_drivers.virtual.devices.gloves import EmulatedWujiGlove
-from skinware_drivers.virtual.devices.gloves import message as wuji_message
+from skinware_drivers.virtual.devices.agni import EmulatedAgni
 from skinware_drivers.virtual.devices.paxini import EmulatedPaxini
 from skinware_drivers.virtual.devices.weiss import EmulatedWeissWts
 from skinware_drivers.virtual.devices.weiss import message as weiss_message
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove
+from skinware_drivers.virtual.devices.wuji_glove import message as wuji_message
 from tests.sdk.driving import Driving, driving_lines
 
 FRAMES = [

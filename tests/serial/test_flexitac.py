@@ -18,7 +18,7 @@ from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.testing.driving import emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual.devices.boards import EmulatedFlexiTac, EmulatedFlexiTacOptions
+from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac, EmulatedFlexiTacOptions
 from tests.sdk.driving import driving_lines, read_until
 from tests.serial.lines import line
 from tests.serial.spoken import Spoken

@@ -13,7 +13,7 @@ from skinware_drivers.testing.comparison import until_fresh
 from skinware_drivers.testing.driving import emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.rig import play
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.devices.boards import EmulatedRobotiqTsf, EmulatedRobotiqTsfOptions
+from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf, EmulatedRobotiqTsfOptions
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.drivers.test_conformance import TestRobotiqTsf as Conformance
 from tests.serial.spoken import Spoken

@@ -12,7 +12,7 @@ from skinware.errors import RequestFailed
 from skinware_drivers.serial.wuji_glove import WujiGloveDriver
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.virtual import Device
-from skinware_drivers.virtual.devices.gloves import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
+from skinware_drivers.virtual.devices.wuji_glove import EmulatedWujiGlove, EmulatedWujiGloveOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
 

@@ -24,22 +24,15 @@ from skinware_drivers.streams.ros2 import Ros2Driver, Ros2Options
 from skinware_drivers.streams.tesollo import TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.streams.xela_server import XelaMessages
 from skinware_drivers.streams.yarp_messages import YarpMessages
-from skinware_drivers.virtual.devices.boards import EmulatedRobotiqTsf, EmulatedRobotiqTsfOptions
 from skinware_drivers.virtual.devices.contactile import EmulatedPapillArray, EmulatedPapillArrayOptions
-from skinware_drivers.virtual.devices.hands import EmulatedTesollo, EmulatedTesolloOptions
-from skinware_drivers.virtual.devices.networks import (
-    EmulatedDex3,
-    EmulatedDex3Options,
-    EmulatedIcubEth,
-    EmulatedIcubEthOptions,
-    EmulatedRos2,
-    EmulatedRos2Options,
-    EmulatedYarp,
-    EmulatedYarpOptions,
-)
+from skinware_drivers.virtual.devices.dds import EmulatedDex3, EmulatedDex3Options, EmulatedRos2, EmulatedRos2Options
+from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, EmulatedIcubEthOptions
+from skinware_drivers.virtual.devices.robotiq_tsf import EmulatedRobotiqTsf, EmulatedRobotiqTsfOptions
+from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from skinware_drivers.virtual.devices.weiss import EmulatedWeissDsa, EmulatedWeissDsaOptions
 from skinware_drivers.virtual.devices.weiss import dsa_message as message
 from skinware_drivers.virtual.devices.xela import EmulatedXelaServer, EmulatedXelaServerOptions
+from skinware_drivers.virtual.devices.yarp import EmulatedYarp, EmulatedYarpOptions
 from tests.serial.spoken import Spoken
 
 _ROWS = 64

@@ -16,7 +16,7 @@ from skinware_drivers.serial.framing import Framed
 from skinware_drivers.streams.icub_eth import IcubEthOptions, rops
 from skinware_drivers.testing.driving import emulated_on, emulated_skin
 from skinware_drivers.testing.waiting import read_until
-from skinware_drivers.virtual.devices.networks import EmulatedIcubEth, datagram
+from skinware_drivers.virtual.devices.icub_eth import EmulatedIcubEth, datagram
 from tests.streams.peers import LOCAL, free_port
 
 HEAD, TAIL = bytes.fromhex("40 F0F0F0F0F0F0F0"), bytes.fromhex("C0 F0F0F0F0F0 8010")

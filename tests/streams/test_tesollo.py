@@ -18,7 +18,7 @@ from skinware_drivers.registry import make_bus
 from skinware_drivers.streams.tesollo import TesolloDriver, TesolloOptions, _Hand
 from skinware_drivers.testing.driving import emulated_on, emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
-from skinware_drivers.virtual.devices.hands import EmulatedTesollo, EmulatedTesolloOptions
+from skinware_drivers.virtual.devices.tesollo import EmulatedTesollo, EmulatedTesolloOptions
 from tests.commands import run
 from tests.serial.spoken import Spoken
 from tests.streams.peers import LOCAL, free_port

@@ -10,7 +10,7 @@ from flexitac import FlexiTacSensor
 
 from skinware_drivers.serial.flexitac import FlexiTacDriver, FlexiTacOptions
 from skinware_drivers.testing.vectors import decode_stream
-from skinware_drivers.virtual.devices.boards import EmulatedFlexiTac, EmulatedFlexiTacOptions
+from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac, EmulatedFlexiTacOptions
 
 ROWS, COLUMNS, SAMPLES = 12, 32, 200
 MARKER = b"\xaa\x55"

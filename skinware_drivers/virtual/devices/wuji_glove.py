@@ -1,7 +1,6 @@
-"""Emulated tactile gloves: of Bielefeld University, which sends from power-up on and hears nothing, and of Wuji.
+"""An emulated tactile glove of Wuji.
 
-Sources: the bytes that tactile-filters ``linux/libio/SerialInput.cpp`` reads; github.com/wuji-technology/wujihandpy
-(MIT) with the vector in tests/serial/test_wuji_glove.py.
+Source: github.com/wuji-technology/wujihandpy (MIT) with the vector in tests/serial/test_wuji_glove.py.
 """
 
 from __future__ import annotations
@@ -15,34 +14,6 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
-
-
-class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    taxels: Annotated[int, Meta(ge=1, le=64, description="taxels of the glove")] = 64
-    period_ms: Annotated[float, Meta(ge=0.1, description="time between two packets of a taxel, ms")] = 30
-
-
-class EmulatedTactileGlove(SerialEmulator[EmulatedTactileGloveOptions]):
-    """One glove, device 1.
-
-    Values: one for each taxel; pressure lowers it.
-    """
-
-    full_scale = 0xFFF
-    rest = 4000
-    swing = -3000
-    streams = "always"
-
-    def places(self) -> Places:
-        return on_a_grid(self.options.taxels, 8)
-
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Name taxels by their first byte: ``0x3c``."""
-        return f"0x{payload[0]:02x}"
-
-    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:  # noqa: ARG002
-        return [bytes((0x3C + taxel, 1, value >> 8, value & 0xFF, 0)) for taxel, value in enumerate(values)]
-
 
 _OK, _BAD_LENGTH, _BAD_CHECKSUM, _UNKNOWN, _BAD_PAYLOAD = 0x00, 0x10, 0x11, 0x12, 0x13
 _NEEDED = {0x0101: 0, 0x0102: 0, 0x0103: 0, 0x0301: 0, 0x0401: 1, 0x0501: 2, 0x0502: 5}  # bytes of arguments

@@ -1,13 +1,8 @@
-"""Emulated ends of robots' networks: topics of DDS, an Ethernet board of iCub, and a port of YARP.
+"""Emulated publishers on DDS: records of the bus ``dds``.
 
-* Dex3-1 hands of Unitree, as the robot's program publishes them, and programs that publish touch on topics of ROS 2:
-  records of the bus ``dds``. Source: unitreerobotics/unitree_ros2, ``unitree_hg/msg``; the participants of
-  tests/streams/dex3_peer.py and ros2_peer.py.
-* Skin boards behind an Ethernet board of iCub. Source: robotology/icub-firmware-shared; the vectors in
-  tests/streams/test_icub_eth.py.
-* A port of an iCub's skin, which sends vectors in a binary carrier. Source: exchanges with YARP 3.8.1 and 4.0.0; the
-  vectors in tests/yarp/test_messages.py. The bus has its name and the name server that knows it: ``skin-emulate
-  --driver yarp --bus yarp://HOST:PORT/NAME``.
+* Dex3-1 hands of Unitree, as the robot's program publishes them. Source: unitreerobotics/unitree_ros2,
+  ``unitree_hg/msg``; the participants of tests/streams/dex3_peer.py.
+* Programs that publish touch on topics of ROS 2; the participants of tests/streams/ros2_peer.py.
 """
 
 from __future__ import annotations
@@ -125,88 +120,3 @@ _DIMENSIONS = (("rows", _ROWS), ("columns", _COLUMNS))
 def _text(text: str) -> bytes:
     data = text.encode() + b"\0"
     return struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
-
-
-_ROOM = 24
-
-
-def datagram(skin: int, records: Sequence[tuple[int, bytes]], number: int, time_us: int) -> bytes:
-    """Return a frame with one signal of a skin, with all its room, after another variable, as in real frames."""
-    items = b"".join(struct.pack("<H8s", len(data) << 12 | can, data) for can, data in records)
-    array = struct.pack("<BBBB", _ROOM, 10, len(records), 0) + items.ljust(10 * _ROOM, b"\0")
-    joint = struct.pack("<BBHI", 0, 4, 8, 0x0100_0004) + b"a joint\0"
-    signal = joint + struct.pack("<BBHI", 0, 4, len(array), 0x0300_0002 | skin << 8) + array
-    return struct.pack("<IHHQQ", 0x12345678, len(signal), 2, time_us, number) + signal + struct.pack("<I", 0x87654321)
-
-
-class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    boards: Annotated[tuple[int, ...], Meta(description="addresses of the skin boards")] = (1,)
-    triangles: Annotated[int, Meta(ge=1, le=12, description="triangles of each board")] = 12
-    skin: Annotated[int, Meta(ge=0, le=1, description="CAN port of the Ethernet board that they are on")] = 0
-    period_ms: Annotated[float, Meta(ge=1, le=255, description="time between two updates of a board, ms")] = 50
-
-
-class EmulatedIcubEth(SerialEmulator[EmulatedIcubEthOptions]):
-    full_scale = 255
-    rest = 240
-    swing = -150
-    speed_mbit_s = 100
-    streams = "always"
-    numbered_by = "boards"
-    _sent = 0
-
-    def places(self) -> Places:
-        return on_pads(*[(12, 4)] * self.options.triangles)
-
-    def kinds(self) -> Sequence[str]:
-        """Name the CAN frames that the board's datagrams carry."""
-        triangles = range(self.options.triangles)
-        return [
-            f"0x{0x400 | board << 4 | triangle:03x}-{half}"
-            for board in self.numbers
-            for triangle in triangles
-            for half in ("head", "tail")
-        ]
-
-    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        records = []
-        for triangle in range(self.options.triangles):
-            can = 0x400 | device.number << 4 | triangle
-            twelve = bytes(values[12 * triangle : 12 * triangle + 12])
-            halves = {"head": b"\x40" + twelve[:7], "tail": b"\xc0" + twelve[7:] + b"\0\0"}
-            records += [(can, data) for half, data in halves.items() if f"0x{can:03x}-{half}" not in self.silent]
-        self._sent += 1
-        return [datagram(self.options.skin, records, self._sent, device.sampled_ns // 1000)]
-
-
-_BOOT_TIME_S = 1_700_000_000.0
-_TAGS = {3: 256 + 10, 4: 256 + 20}
-
-
-class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    length: Annotated[int, Meta(ge=1, le=3072, description="values of a message")] = 192
-    yarp: Annotated[
-        Literal[3, 4], Meta(description="major version of its YARP, which decides how a list of doubles is marked")
-    ] = 4
-    envelope: Annotated[bool, Meta(description="send number and time of each message")] = True
-    period_ms: Annotated[float, Meta(ge=1, description="time between two messages, ms")] = 20
-
-
-class EmulatedYarp(SerialEmulator[EmulatedYarpOptions]):
-    full_scale = 255
-    rest = 0
-    swing = 150
-    speed_mbit_s = 100
-    streams = "always"
-
-    def places(self) -> Places:
-        return on_pads(*[(min(12, self.options.length - first), 4) for first in range(0, self.options.length, 12)])
-
-    def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
-        """Return one vector, as in YARP's binary carriers."""
-        text = f"D {device.cycle} {_BOOT_TIME_S + device.sampled_ns / 1e9:.6f}\0".encode()
-        command = struct.pack("<i", len(text)) + b"~\0\0\1" + text if self.options.envelope else b"\0\0\0\0~D\0\1"
-        head = struct.pack("<ii", _TAGS[self.options.yarp], len(values))
-        numbers = struct.pack(f"<{len(values)}d", *values)
-        index = struct.pack("<3ii", len(command), len(head), len(numbers), 0)
-        return [b"YA\n\0\0\0RP\3\1" + 8 * b"\xff" + index + command + head + numbers]

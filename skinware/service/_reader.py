@@ -70,6 +70,15 @@ class ServiceReader(Taking[SampleT]):
         sequence = self._ring.latest
         return (self._ring.generation, sequence) if sequence else None
 
+    @property
+    def waiting(self) -> int:
+        """Number of samples of the generation at hand that are newer than the last one that was taken."""
+        ring, last = self._ring, self._last_taken
+        taken: int = 0 if last is None or last[0] != ring.generation else last[1]
+        if self._turns_in_c:
+            taken = ring.state_in_c.last
+        return ring.latest - taken
+
     def refresh(self) -> Position | None:
         """Go over to a newer generation if there is one; position of the newest sample then.
 
@@ -111,6 +120,14 @@ class ServiceReader(Taking[SampleT]):
         if known is not None:
             return self._take_turn(NEWER, timeout_ns, max_age_s, known)
         return self._read(None, max_age_s, now_ns() + timeout_ns)
+
+    def read_next(self, *, timeout_s: float | None = 5.0) -> SampleT:
+        """Return the sample after the last one taken, as ``in_order`` does; the newest one at first.
+
+        Raises:
+            ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
+        """
+        return self._take_turn(NEXT, _in_ns(timeout_s))
 
     def latest(self) -> SampleT | None:
         """Return the newest sample at once, as a private copy; None if nothing was published yet.

@@ -272,7 +272,12 @@ class CalmService:
         self.motion.publish(time_ns)
 
     def _warn(self, chain: Chain) -> None:
-        """Warn once of the sensors of each type that wait for their baselines, and that a touch seems to lower."""
+        """Warn once of being too slow, of sensors that wait for their baselines, and of those that a touch lowers."""
+        if self._is_new(("", "slow"), self._source.is_too_slow):
+            log.warning(
+                "%s: samples come faster than they can be taken: from now on only the newest, as long as that is so",
+                self.name,
+            )
         for name, stage in chain.baseline_stages.items():
             share = stage.baseline.refused_share
             if self._is_new((name, "moves"), share > 0):

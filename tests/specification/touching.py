@@ -9,8 +9,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.virtual.physics.body import PhysicsScene
-from skinware_drivers.virtual.physics.contacts import Touching
+from skinware_drivers.virtual.physics.scene import PhysicsScene, Touching
 from skinware_drivers.virtual.physics.taxels import BoundTaxels
 
 ArrayF = npt.NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from skinware_drivers.virtual.device import EmulatorOptions
 from skinware_drivers.virtual.hardware import load_emulator
 from skinware_drivers.virtual.physics.binding import SCENES, Bound
-from skinware_drivers.virtual.physics.body import PhysicsScene
+from skinware_drivers.virtual.physics.scene import PhysicsScene
 from skinware_drivers.virtual.physics.transfer import Transfer
 
 PAD = SCENES / "pad.xml"

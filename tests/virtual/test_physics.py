@@ -16,7 +16,7 @@ from skinware.errors import ConfigurationError, MissingExtra
 from skinware.geometry import GeometryGroup, geometry_to_toml, read_geometry
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.physics.binding import find_binding
-from skinware_drivers.virtual.physics.body import PhysicsScene
+from skinware_drivers.virtual.physics.scene import PhysicsScene
 from skinware_drivers.virtual.physics.taxels import places_in
 from skinware_drivers.virtual.physics.transfer import Transfer, TransferSettings
 from skinware_drivers.virtual.physics.world import PhysicsWorld

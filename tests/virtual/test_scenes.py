@@ -12,7 +12,7 @@ import numpy as np
 
 from skinware_drivers.virtual.hardware import load_emulator
 from skinware_drivers.virtual.physics.binding import SCENES, find_binding
-from skinware_drivers.virtual.physics.body import PhysicsScene
+from skinware_drivers.virtual.physics.scene import PhysicsScene
 
 from .rig import MS, START_NS
 from .scenes import course_of, hardware_in

@@ -30,7 +30,7 @@ from skinware.tactile.testing import Surface
 from skinware_drivers.learning import SkinEnv
 from skinware_drivers.virtual.physics import WORLD_NS
 from skinware_drivers.virtual.physics.binding import Bound, find_binding
-from skinware_drivers.virtual.physics.contacts import Touching
+from skinware_drivers.virtual.physics.scene import Touching
 from skinware_drivers.virtual.physics.world import PhysicsWorld
 from tests.specification.chain import Onsets
 from tests.virtual.self_touch import RADIUS_M, gathered, placed, self_touch

@@ -23,7 +23,7 @@ from skinware.realtime import NS_PER_S
 from skinware.recording import Recording
 from skinware.service import ServiceReader
 from skinware_drivers.virtual.physics.binding import find_binding
-from skinware_drivers.virtual.physics.body import PhysicsScene
+from skinware_drivers.virtual.physics.scene import PhysicsScene
 from tests.browser.chromium import chromium
 
 PAGE, SCENE = (960, 600), (400, 600)

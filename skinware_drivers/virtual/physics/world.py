@@ -14,7 +14,7 @@ from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceWriter
 from skinware_drivers.virtual.physics.binding import Bound
-from skinware_drivers.virtual.physics.body import PhysicsScene
+from skinware_drivers.virtual.physics.scene import PhysicsScene
 from skinware_drivers.virtual.physics.transfer import Transfer
 
 TRUTH, JOINTS, POSE = "truth", "joints", "pose"

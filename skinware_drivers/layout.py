@@ -17,17 +17,7 @@ import numpy.typing as npt
 from skinware.errors import ConfigurationError
 from skinware.status import LONGEST_PERIOD_S
 from skinware_drivers.bus import check_identifier
-from skinware_drivers.fields import (
-    AnyFlag,
-    Bits,
-    Byte,
-    Condition,
-    DeviceTime,
-    Flag,
-    Identifier,
-    Packed,
-    SequenceNumber,
-)
+from skinware_drivers.fields import AnyFlag, Bits, Byte, Condition, DeviceTime, Flag, Identifier, Packed, SequenceNumber
 
 MOST_FRAMES = 200
 """Kinds of frame that a driver can have, over all its buses."""

@@ -15,14 +15,7 @@ import numpy.typing as npt
 
 from skinware.errors import BusSendError, HandshakeTimeout
 from skinware.realtime import NS_PER_S, now_ns
-from skinware_drivers.bus import (
-    REMOTE_FLAG,
-    Bus,
-    Filter,
-    FrameBatch,
-    check_identifier,
-    identifier_text,
-)
+from skinware_drivers.bus import REMOTE_FLAG, Bus, Filter, FrameBatch, check_identifier, identifier_text
 from skinware_drivers.decoding.addresses import fewest, filters_of
 from skinware_drivers.fields import Match, Reply
 from skinware_drivers.layout import Layout

@@ -8,19 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from skinware.wire import (
-    BATCH_BYTES,
-    BYTES,
-    CLASSIC,
-    FD,
-    IS_CUT,
-    IS_FD,
-    MOST_BYTES,
-    MOST_FRAMES,
-    PIECE,
-    ROWS,
-    size_of,
-)
+from skinware.wire import BATCH_BYTES, BYTES, CLASSIC, FD, IS_CUT, IS_FD, MOST_BYTES, MOST_FRAMES, PIECE, ROWS, size_of
 
 _ROOM = 1 << 20
 """Bytes that can wait to be fetched."""

@@ -277,13 +277,7 @@ def _imported(
 def _learning_set(
     file: Path, output: Path | None, selection: Selection, options: dict[str, Any], time_and_end: dict[str, Any]
 ) -> Converted:
-    from skinware.conversion.learning import (
-        LearningSet,
-        convert_to_learning_set,
-        interval_of,
-        join_of,
-        read_intervals,
-    )
+    from skinware.conversion.learning import LearningSet, convert_to_learning_set, interval_of, join_of, read_intervals
 
     intervals = [interval_of(text) for text in options["episode"]]
     if options["episodes"] is not None:

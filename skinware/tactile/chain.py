@@ -23,15 +23,7 @@ from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
 from skinware.tactile.baseline import SHOWN, UNUSABLE, Baseline, BaselineSettings, Calm
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
-from skinware.tactile.stages import (
-    STRUCTS,
-    AmplifierSettings,
-    FilterSettings,
-    ScalerSettings,
-    Signal,
-    Stage,
-    Taxels,
-)
+from skinware.tactile.stages import STRUCTS, AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
 from skinware.tactile.thermal import ThermalSettings
 from skinware.tactile.vectors import FieldSettings, VectorSettings, VectorStage, vectors_of
 from skinware.toml_text import TomlText

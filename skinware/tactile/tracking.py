@@ -10,17 +10,7 @@ import numpy as np
 from skinware.realtime import NS_PER_S
 from skinware.tactile.arrays import Arrays, Doubles, Flags, Whole
 from skinware.tactile.meetings import Meetings, fit_bells, resume
-from skinware.tactile.tracks import (
-    TRACK,
-    TouchedBlobs,
-    Tracks,
-    assign,
-    correct,
-    expected_at,
-    judge,
-    move,
-    without_nan,
-)
+from skinware.tactile.tracks import TRACK, TouchedBlobs, Tracks, assign, correct, expected_at, judge, move, without_nan
 
 _STRONG, _WEAK, _LEFT, _NEAR = 5.0, 1.5, 0.3, 0.1
 """Gains of a pair that shares half of the smaller one's taxels, any, is what was left behind, or is near: one of the

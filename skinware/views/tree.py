@@ -9,16 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import now_ns
-from skinware.state import (
-    DEAD,
-    LIVE,
-    PAUSED,
-    SILENT,
-    STARTING,
-    WITHOUT_NEWS,
-    DriverReport,
-    badness,
-)
+from skinware.state import DEAD, LIVE, PAUSED, SILENT, STARTING, WITHOUT_NEWS, DriverReport, badness
 from skinware.status import Status, Why
 from skinware.structure import Structure
 from skinware.text import SETTLING, age_text, count_text, plural, words

@@ -86,11 +86,7 @@ async def look(
     from skinware.errors import BusNotAvailable
     from skinware_drivers.can.controller import NO_CAN
     from skinware_drivers.finding.guess import known_drivers
-    from skinware_drivers.finding.interfaces import (
-        NO_INTERFACE,
-        can_interfaces,
-        kernel_has_can,
-    )
+    from skinware_drivers.finding.interfaces import NO_INTERFACE, can_interfaces, kernel_has_can
     from skinware_drivers.finding.looking import listen, topics_on
     from skinware_drivers.finding.running import driver_on, running_drivers
     from skinware_drivers.registry import make_bus

@@ -33,15 +33,7 @@ from skinware_drivers.fields import Reply
 from skinware_drivers.hand import Hand
 from skinware_drivers.serial import LRC, Field, Length, LengthTable, Packet, Refused, Split
 from skinware_drivers.serial.framing import Framing
-from skinware_drivers.serial.paxini_modules import (
-    MOST_POINTS,
-    SATURATED,
-    TAXEL,
-    Slot,
-    module,
-    nominal_places,
-    values,
-)
+from skinware_drivers.serial.paxini_modules import MOST_POINTS, SATURATED, TAXEL, Slot, module, nominal_places, values
 
 VERSION_BYTES = 15
 STRANGE = 0x57

@@ -22,12 +22,7 @@ from skinware_drivers.options import options_of
 from skinware_drivers.running.patch_care import why_unused
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.testing.waiting import defect, require, run_in_its_time
-from skinware_drivers.testing.wire import (
-    Interference,
-    Pattern,
-    Truth,
-    make_bus,
-)
+from skinware_drivers.testing.wire import Interference, Pattern, Truth, make_bus
 from skinware_drivers.virtual.emulator import each_value
 from skinware_drivers.virtual.hand_clock import HandClock
 from skinware_drivers.virtual.snapshot_log import SnapshotLog

@@ -283,7 +283,7 @@ class Stage(ABC, HasOptions[OptionsT]):
         self._run_world(now_ns)
         for device in self.devices.values():
             self.boot(device, now_ns)
-        for number in self.dying():
+        for number in options.dead:
             self.schedule(now_ns + round(options.dead_after_s * 1e9), partial(self.die, self.devices[number]))
         for number in options.restart:
             restart = partial(self.lose_power_for_a_moment, self.devices[number])
@@ -306,10 +306,6 @@ class Stage(ABC, HasOptions[OptionsT]):
                 self.world.advance(time_ns)
             again_ns = max(self.world.advanced_ns + WORLD_NS, self._now_ns - _LONGEST_CATCH_UP_NS)
             self.schedule(again_ns, self._run_world)
-
-    def dying(self) -> Sequence[int]:
-        """Return the devices that die at the time of the option ``dead_after_s``."""
-        return self.options.dead
 
     def device(self, number: int) -> Device:
         for device in self.devices.values():

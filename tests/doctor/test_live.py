@@ -69,7 +69,7 @@ def test_no_driver_at_all() -> None:
 
 
 def test_a_board_that_dies(skins: Skins) -> None:
-    skins("roboskin", boards=(7, 8), dead=(8,), dead_after_cycles=5)
+    skins("roboskin", boards=(7, 8), dead=(8,))
     finding = found_until(of("patches", "board 8 fell silent"))
     assert (finding.severity, finding.see) == (Severity.ERROR, "reference/faults.md#patches")
     assert "1 of 2 patches are live" in finding.evidence

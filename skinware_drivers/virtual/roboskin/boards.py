@@ -129,7 +129,6 @@ class EmulatedBoard(Device):
 
     Attributes:
         command_bytes: bytes of each command; shorter ones are ignored here, real boards read old bytes of their buffer.
-        last_cycle: bursts after which it dies; None: it lives on.
     """
 
     is_mtb3: ClassVar[bool]
@@ -156,7 +155,6 @@ class EmulatedBoard(Device):
         self.touch = Touch(options.seed, options.boards.index(address), skin)
         self._source = source
         self.faults = TriangleFaults(options, address)
-        self.last_cycle = options.dead_after_cycles if address in options.dead else None
         self._phase = phase
         self._identifiers_for: tuple[object, list[int]] = None, []
 
@@ -174,7 +172,6 @@ class EmulatedBoard(Device):
 
     def clear(self) -> None:
         super().clear()
-        self.last_cycle = None
         self.touch.stream_from(None)
 
     def receive(self, identifier: int, payload: bytes, now_ns: int) -> bool:
@@ -215,8 +212,6 @@ class EmulatedBoard(Device):
         if name == _INERTIAL:
             for low, payload in self.inertial.messages(time_ns):
                 self._send(time_ns, INERTIAL, low, payload)
-        elif self.last_cycle is not None and self.cycle >= self.last_cycle:
-            self.stage.die(self, time_ns)
         elif self._active.any():
             self._burst(time_ns)
 

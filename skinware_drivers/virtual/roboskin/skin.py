@@ -109,9 +109,6 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
                 for command in _CONFIGURED:
                     self.obey(device, 0x200 | device.number, command, now_ns)
 
-    def dying(self) -> Sequence[int]:
-        return self.options.dead if self.options.dead_after_cycles is None else ()
-
     def boot(self, device: Device, now_ns: int) -> None:
         _board(device).begin(now_ns)
 

@@ -18,7 +18,7 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.realtime import NS_PER_S
 from skinware.tactile.testing import ARM_FRAME, Wander, World, arm, arm_path, read_stage
-from skinware_drivers.virtual.device import Count, EmulatorOptions, Seconds
+from skinware_drivers.virtual.device import Count, EmulatorOptions
 from skinware_drivers.virtual.hardware import Point, Pressing
 
 if TYPE_CHECKING:
@@ -43,10 +43,6 @@ class EmulatedRoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_field
         Meta(ge=0, le=7, description="message class of the second frame; 6 in the firmware variant for TLR"),
     ] = 4
 
-    dead_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the death of the boards of dead")] = 0.0
-    dead_after_cycles: Annotated[
-        Count | None, Meta(description="bursts before their death, instead of dead_after_s")
-    ] = None
     not_connected: Annotated[
         tuple[str, ...], Meta(description="triangles that were never plugged in, as BOARD/TRIANGLE")
     ] = ()

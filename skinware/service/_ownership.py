@@ -1,4 +1,4 @@
-"""Own a service's name: its generations, its files, and its state."""
+"""Own a service's name: its lock, whatever a killed owner left, its generations, its files, and its state."""
 
 from __future__ import annotations
 
@@ -6,15 +6,20 @@ import contextlib
 import inspect
 import logging
 import os
+import re
+import secrets
+import struct
 import threading
+import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy.typing as npt
 
 from skinware.errors import BadServiceFile, Closed, NameInUse, NamespaceError, ServiceNotFound
-from skinware.memory import file_layout, name_lock, segments
+from skinware.memory import file_layout, segments
 from skinware.memory.announcement import sweep
+from skinware.memory.locks import Descriptor, Process, has_ended, this_process, try_lock
 from skinware.memory.namespace import Namespace, check_name
 from skinware.memory.ring_writer import RingWriter
 from skinware.memory.schema import Column, Schema
@@ -24,6 +29,13 @@ from skinware.service._server import RequestServer
 log = logging.getLogger("skinware.service")
 
 _FILE_CHECK_NS = NS_PER_S
+_COUNT = struct.Struct("<Q")
+_MOST_FRAMES = 1 << 62
+"""A greater count is of a forged or damaged file: 146,000 years at 1 MHz."""
+_HOLDER = struct.Struct("<QQQ")
+"""In the file of a name's lock, behind the count: the :class:`Process` that took it last."""
+_ORPHAN_S = 2.0
+"""How long a child that was forked just before its parent was killed may take to close the lock that it inherited."""
 
 Columns = Mapping[str, Column | tuple[npt.DTypeLike, int | tuple[int, ...]]]
 """Every array of a sample, by name: dtype and length, dtype and shape, or a :class:`Column`."""
@@ -58,7 +70,7 @@ class Ownership:
         self._next_file_check_ns = 0
         self._file_trouble = ""
         self.namespace.create(group)
-        self._name_lock = name_lock.take_name(self.namespace, name)
+        self._name_lock = take_name(self.namespace, name)
         try:
             sweep(self.namespace)
             try:
@@ -66,7 +78,7 @@ class Ownership:
             except (ServiceNotFound, BadServiceFile):
                 previous = None
             if published_before is None:
-                published_before = name_lock.published_so_far(self._name_lock, previous)
+                published_before = _published_so_far(self._name_lock, previous)
             self._begin_generation(schema, static, period_ns, previous, published_before)
         except BaseException:
             self._name_lock.close()
@@ -166,7 +178,7 @@ class Ownership:
             return
         with self._changing:
             segment = self._ring.segment
-            name_lock.note_published(self._name_lock, segment.published)
+            _note_published(self._name_lock, segment.published)
             path = self.namespace.ring_path(self.name)
             if segments.current_inode(path) == segment.inode:
                 path.unlink()
@@ -249,7 +261,7 @@ class Ownership:
         if os.fstat(self._name_lock.fd).st_nlink == 0:
             self.namespace.create(self._group)
             try:
-                taken = name_lock.take_name(self.namespace, self.name)
+                taken = take_name(self.namespace, self.name)
             except NameInUse:
                 self.close()
                 raise
@@ -259,3 +271,94 @@ class Ownership:
             self._succeed(self._ring.segment.schema, self._static)
         if self._server is not None:
             self._server.keep()
+
+
+def take_name(namespace: Namespace, name: str) -> Descriptor:
+    """Become the owner of a service's name, for as long as the returned descriptor is open.
+
+    What the owner before left half made or cannot take back (it was killed) is removed, but for the ring: readers still
+    want its last sample. A child of a killed owner may still have the lock: for a moment where Python forked it, which
+    is waited for, and as long as it lives where C did; its lock's file is then replaced.
+
+    Raises:
+        NameInUse: a living process owns it.
+        NamespaceError: the lock file cannot be used.
+    """
+    path = namespace.lock_path(name)
+    deadline = time.monotonic() + _ORPHAN_S
+    while True:
+        try:
+            descriptor = Descriptor(os.open(path, segments.OPEN_FLAGS | os.O_RDWR | os.O_CREAT, 0o600))
+        except OSError as error:
+            raise NamespaceError(f"cannot open the lock {path}: {error.strerror}") from None
+        if try_lock(descriptor.fd):
+            try:
+                os.pwrite(descriptor.fd, _HOLDER.pack(*this_process()), _COUNT.size)
+            except OSError as error:
+                raise NamespaceError(f"cannot write the lock {path}: {error.strerror}") from None
+            if segments.current_inode(path) == segments.inode_of(descriptor.fd):
+                break  # otherwise it was removed or replaced meanwhile
+        elif not _holder_has_ended(descriptor.fd):
+            descriptor.close()
+            raise NameInUse(
+                f"a running driver or service is called {name!r} in namespace {namespace.name!r};"
+                " stop it (skin-info shows its pid), or choose another name or namespace (SKINWARE_NAMESPACE)"
+            )
+        elif time.monotonic() > deadline:
+            _replace_lock(namespace, name, descriptor)
+        else:
+            time.sleep(0.005)
+        descriptor.close()
+    leftover = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{8}}\.tmp|sock)|{re.escape(name)}\.sock")
+    try:
+        for entry in os.listdir(namespace.path):
+            if leftover.fullmatch(entry):
+                os.unlink(namespace.path / entry)
+    except OSError as error:
+        descriptor.close()
+        raise NamespaceError(f"cannot remove what a dead {name!r} left in {namespace.path}: {error.strerror}") from None
+    return descriptor
+
+
+def _holder_has_ended(fd: int) -> bool:
+    """Return whether the process that took a lock has ended, so that a child of it holds the lock."""
+    noted = os.pread(fd, _HOLDER.size, _COUNT.size)
+    return len(noted) == _HOLDER.size and has_ended(Process(*_HOLDER.unpack(noted)))
+
+
+def _replace_lock(namespace: Namespace, name: str, held: Descriptor) -> None:
+    """Put a free lock in the place of one that a child of a dead owner holds; the count in it is kept.
+
+    Where two programs do so at once, the owner notices within a second that its lock is gone, as after any removal
+    (``Ownership.keep_files``).
+    """
+    path = namespace.lock_path(name)
+    if segments.current_inode(path) != segments.inode_of(held.fd):
+        return
+    temporary = namespace.path / f".{name}.{secrets.token_hex(4)}.tmp"
+    try:
+        with open(os.open(temporary, segments.OPEN_FLAGS | os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(os.pread(held.fd, _COUNT.size, 0))
+        os.rename(temporary, path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            os.unlink(temporary)
+        raise NamespaceError(f"cannot replace the lock {path}: {error.strerror}") from None
+
+
+def _published_so_far(name_lock: Descriptor, last: segments.Segment | None) -> int:
+    """Return the number of samples that were published under a name before.
+
+    A writer that is closed leaves the count in the file of the lock, one that is killed in its ring. Absurd counts are
+    not believed.
+    """
+    noted = os.pread(name_lock.fd, _COUNT.size, 0)
+    count: int = _COUNT.unpack(noted)[0] if len(noted) == _COUNT.size else 0
+    counts = (count, last.published if last is not None else 0)
+    return max((count for count in counts if count <= _MOST_FRAMES), default=0)
+
+
+def _note_published(name_lock: Descriptor, count: int) -> None:
+    """Leave word for the next owner of the name."""
+    with contextlib.suppress(OSError):  # shared memory is full
+        os.pwrite(name_lock.fd, _COUNT.pack(count), 0)

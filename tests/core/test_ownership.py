@@ -111,7 +111,7 @@ def test_a_child_that_c_forked_keeps_neither_a_dead_driver_alive_nor_its_name(
             with pytest.raises(PeerGone):
                 reader.request()
             last = reader.newest_position
-            monkeypatch.setattr("skinware.memory.name_lock._ORPHAN_S", 0.0)
+            monkeypatch.setattr("skinware.service._ownership._ORPHAN_S", 0.0)
             with ServiceWriter("x", COLUMNS) as again:
                 again.begin()["values"][:] = 1
                 again.commit(1)

@@ -12,12 +12,13 @@ import pytest
 
 from skinware import Column, Namespace, Sample, ServiceReader, ServiceWriter, native
 from skinware.errors import Overrun, Paused, ServiceError, ServiceTimeout, StructureChanged
-from skinware.memory import file_layout, name_lock, ring_reader, segments
+from skinware.memory import file_layout, ring_reader, segments
 from skinware.memory import ring as ring_module
 from skinware.memory.ring_reader import RingReader
 from skinware.memory.ring_writer import RingWriter
 from skinware.memory.schema import Schema
 from skinware.realtime import now_ns
+from skinware.service._ownership import take_name
 from skinware_drivers.testing.waiting import wait_until
 from tests.core.services import SMALL, publish
 
@@ -244,7 +245,7 @@ def test_a_writer_that_is_closed_in_its_loop_ends_the_loop() -> None:
 
 def test_ring_positions_survive_wrap_around(namespace: Namespace) -> None:
     namespace.create()
-    lock = name_lock.take_name(namespace, "x")
+    lock = take_name(namespace, "x")
     schema = Schema.of(SMALL, "")
     segment = segments.create(namespace, "x", schema, {}, slots=2, kind="data", period_ns=0, published_before=0)
     writer = RingWriter(segment)

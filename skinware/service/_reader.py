@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.announcement import ReaderRecord
+from skinware.memory.file_layout import MAX_SLOTS
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import ACQUIRED, Sample, SampleT
@@ -32,6 +33,9 @@ class ServiceReader(Taking[SampleT]):
         timeout_s: how long to wait for the service to appear; 0 for not at all, None for no limit.
         announce: let others see this reader (``skin-info``).
 
+    Attributes:
+        left_out: number of samples that ``read_next`` has left out because this program is too slow.
+
     Raises:
         ServiceNotFound: it did not appear in time.
         BadServiceFile: its file cannot be read safely.
@@ -47,6 +51,8 @@ class ServiceReader(Taking[SampleT]):
         announce: bool = True,
     ) -> None:
         super().__init__(name, namespace, timeout_s, announce)
+        self.left_out: int = 0
+        self._waiting_then, self._came_since = 0, 0
 
     @property
     def missed(self) -> int:
@@ -122,12 +128,24 @@ class ServiceReader(Taking[SampleT]):
         return self._read(None, max_age_s, now_ns() + timeout_ns)
 
     def read_next(self, *, timeout_s: float | None = 5.0) -> SampleT:
-        """Return the sample after the last one taken, as ``in_order`` does; the newest one at first.
+        """Return the sample after the last one taken, and the newest at first: a program that was held up catches up.
+
+        If 64 more come before it has, it is too slow: it gets the newest ones, until none waits. ``left_out`` counts
+        those between, as ``missed`` does.
 
         Raises:
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
         """
-        return self._take_turn(NEXT, _in_ns(timeout_s))
+        before, waiting = self._waiting_then, self.waiting
+        if waiting == 0:
+            self._came_since = 0
+        elif before > 0:
+            self._came_since += max(0, waiting - before)
+        is_too_slow = waiting > 1 and self._came_since >= MAX_SLOTS
+        self._waiting_then = 0 if is_too_slow else max(0, waiting - 1)
+        if is_too_slow:
+            self.left_out += waiting - 1
+        return self._take_turn(NEWER if is_too_slow else NEXT, _in_ns(timeout_s))
 
     def latest(self) -> SampleT | None:
         """Return the newest sample at once, as a private copy; None if nothing was published yet.

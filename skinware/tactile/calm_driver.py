@@ -14,31 +14,19 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import BadServiceFile, Overrun, Paused, ServiceNotFound, ServiceTimeout, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, now_ns
-from skinware.service import Position
 from skinware.status import PatchState, Status
 from skinware.structure import Structure
 
 _WAIT_S = WAIT_SLICE_NS / NS_PER_S
-_MOST_WHILE_LATE = 64
 
 
 class DriverSource:
-    """Reads each sample of a driver that may stop, restart and change.
-
-    After a hold-up it reads what the ring still has, in its order. If the driver publishes 64 samples before nothing
-    waits any more, this program is too slow: then each sample is the newest one, until nothing waits.
-
-    Attributes:
-        reader: of the driver; None before it was found. Its ``missed`` counts the samples that were left out.
-        is_too_slow: samples were left out because more came than could be taken.
-    """
+    """Reads each sample of a driver that may stop, restart and change; ``reader`` is None before it was found."""
 
     def __init__(self, name: str, namespace: Namespace) -> None:
         self._name, self._namespace = name, namespace
         self.reader: DriverReader | None = None
-        self.is_too_slow = False
-        self._waiting, self._came = 0, 0  # samples after the last one; those that came since nothing waited
-        self._last: Position | None = None
+        self._is_first = True
         self._structure: Structure | None = None
 
     @property
@@ -52,7 +40,7 @@ class DriverSource:
                 self.reader = DriverReader(self._name, namespace=self._namespace)
                 return None
             try:
-                frame = self._take(self.reader)
+                frame = self.reader.read_next(timeout_s=_WAIT_S)
             except StructureChanged:
                 self.reader.reattach()
                 return None
@@ -61,20 +49,8 @@ class DriverSource:
         except (ServiceNotFound, BadServiceFile):
             time.sleep(_WAIT_S)
             return None
-        is_first, self._last = self._last is None, frame.position
+        is_first, self._is_first = self._is_first, False
         return None if frame.stale and is_first else frame
-
-    def _take(self, reader: DriverReader) -> DriverSnapshot:
-        before, waiting = self._waiting, reader.waiting
-        if waiting == 0:
-            self._came = 0
-        elif before > 0:
-            self._came += max(0, waiting - before)
-        if waiting > 1 and self._came >= _MOST_WHILE_LATE:
-            self.is_too_slow, self._waiting = True, 0
-            return reader.read(newer_than=self._last, timeout_s=_WAIT_S)
-        self._waiting = max(0, waiting - 1)
-        return reader.read_next(timeout_s=_WAIT_S)
 
     def has_changed(self, frame: DriverSnapshot) -> bool:
         """Whether a sample has another structure than the sample before it."""

@@ -273,10 +273,10 @@ class CalmService:
 
     def _warn(self, chain: Chain) -> None:
         """Warn once of being too slow, of sensors that wait for their baselines, and of those that a touch lowers."""
-        if self._is_new(("", "slow"), self._source.is_too_slow):
+        reader = self._source.reader
+        if self._is_new(("", "slow"), reader is not None and reader.left_out > 0):
             log.warning(
-                "%s: samples come faster than they can be taken: from now on only the newest, as long as that is so",
-                self.name,
+                "%s: samples come faster than they can be taken: only the newest are, as long as that is so", self.name
             )
         for name, stage in chain.baseline_stages.items():
             share = stage.baseline.refused_share

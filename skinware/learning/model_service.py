@@ -34,7 +34,7 @@ class ModelService:
     Columns of a sample: those of the model (``output`` for a single array), ``latency_ms`` (1,) from the newest data to
     the output, ``failed`` (1,) uint8 and ``failures`` (1,) uint64. If the model raises, returns other shapes or numbers
     that are not finite, the sample has the output before and ``failed`` 1; the service goes on. A model that is slower
-    than the driver misses samples.
+    than the driver misses windows; those that it gets have each sample that the ring still had.
 
     Args:
         model: see :data:`Model`.
@@ -92,13 +92,15 @@ class ModelService:
         Raises:
             StructureChanged: the driver came back with other sensors: make a new service.
         """
-        sample: DriverSnapshot | None = None
         while not is_stopped():
             try:
-                sample = self._reader.read(newer_than=sample, timeout_s=_TURN_S)
+                sample = self._reader.read_next(timeout_s=_TURN_S)
             except ServiceTimeout:
                 continue
-            self.take(sample)
+            if self._reader.waiting:
+                self._window.add(sample)
+            else:
+                self.take(sample)
 
     def take(self, sample: DriverSnapshot) -> None:
         """Add a sample of the driver; call the model and publish as soon as the window is full."""

@@ -72,6 +72,32 @@ def test_its_failures_are_counted_and_the_output_before_stays(caplog: pytest.Log
     caplog.clear()
 
 
+def test_a_slow_model_misses_windows_but_no_sample_in_them() -> None:
+    windows: list[list[float]] = []
+
+    def note(values: Values, position: Values) -> npt.NDArray[np.float32]:
+        windows.append(values[:, 0].tolist())
+        return np.zeros_like(position)
+
+    with DriverWriter("hand", hand(), rate_hz=50) as writer:
+
+        def publish_all(*values: int) -> None:
+            for value in values:
+                publish(writer, value, now_ns())
+
+        publish_all(1)
+        with ModelService(note, "hand", window=2) as service:
+            turns = iter([(), (2,), (3, 4, 5), (), (), None])
+
+            def is_stopped() -> bool:
+                values = next(turns)
+                publish_all(*(values or ()))
+                return values is None
+
+            service.run(is_stopped)
+    assert windows == [[0, 0], [1, 2], [4, 5]]
+
+
 def test_it_runs_beside_a_driver_that_comes_back() -> None:
     stop = threading.Event()
     with DriverWriter("hand", hand(), rate_hz=50) as writer:

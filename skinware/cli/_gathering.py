@@ -201,8 +201,11 @@ class Gathering:
         for frame in frames_until(
             self._reader, lambda: self._session.is_complete(share) or time_is_over() or enter_pressed()
         ):
-            pose = None if self.poses is None else self.poses.newest()
-            self._session.take(frame.acquired_ns, self.source.loads(frame), pose)
+            loads = self.source.loads(frame)
+            if self.poses is None:
+                self._session.take(frame.acquired_ns, loads, None)
+            elif not self._reader.waiting:  # a pose belongs to the newest sample
+                self._session.take(frame.acquired_ns, loads, self.poses.newest())
             if report_due():
                 report_due = after(_REPORT_EVERY_S)
                 self._report_progress()

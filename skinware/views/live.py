@@ -302,22 +302,22 @@ def reader_of(namespace: Namespace, driver: str | None, how: str) -> DriverReade
 
 
 def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[DriverSnapshot]:
-    """Yield the driver's newest snapshots, each once.
+    """Yield the driver's newest snapshot, and those after it, each once.
 
     Args:
         is_over: called before each snapshot, and ten times a second while none arrives; True ends it.
     """
-    newest: DriverSnapshot | None = None
+    read: Callable[..., DriverSnapshot] = reader.read
     heard_s = time.monotonic()
     while not is_over():
         try:
-            newest = reader.read(newer_than=newest, timeout_s=_WAIT_S)
+            snapshot = read(timeout_s=_WAIT_S)
         except ServiceTimeout:
             if time.monotonic() - heard_s > _SILENT_S:
                 raise
             continue
-        heard_s = time.monotonic()
-        yield newest
+        read, heard_s = reader.read_next, time.monotonic()
+        yield snapshot
 
 
 def after(seconds: float) -> Callable[[], bool]:

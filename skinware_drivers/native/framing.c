@@ -118,22 +118,9 @@ static int64_t total_of(const struct framing *framing, const uint8_t *frame, int
     return total >= framing->shortest && total <= framing->longest ? total : 0;
 }
 
-/* Whether a frame ends as it should and, if it must, is followed by another. */
-static enum verdict form_of(const struct framing *framing, const struct stream *stream, int64_t total)
+static bool ends(const struct framing *framing, const uint8_t *end)
 {
-    const uint8_t *frame = stream->bytes + stream->place, *trailer = framing->trailer;
-    int64_t n = framing->n_trailer, left = stream->size - stream->place;
-    bool follows = !framing->look_ahead ||
-                   (!framing->confirms_each && stream->before + stream->place == stream->follows_at);
-    if (!fits(trailer, n, frame + total - n, n))
-        return BAD;
-    if (follows)
-        return GOOD;
-    if (left < total + framing->look_ahead)
-        return INCOMPLETE;
-    if (!fits(framing->sync, framing->n_sync, frame + total, left - total))
-        return BAD;
-    return !n || fits(trailer, n, frame + 2 * total - n, n) ? GOOD : BAD;
+    return fits(framing->trailer, framing->n_trailer, end - framing->n_trailer, framing->n_trailer);
 }
 
 static bool has_checksum(const struct framing *framing, const uint8_t *frame, int64_t total)
@@ -143,8 +130,178 @@ static bool has_checksum(const struct framing *framing, const uint8_t *frame, in
     return !framing->checksum.size || is_right(&framing->checksum, frame + from, to - from, frame + at);
 }
 
+static bool take_packet(
+    const struct framing *framing, struct stream *stream, int64_t total, bool is_bare, struct found *found)
+{
+    const uint8_t *frame = stream->bytes + stream->place;
+    int64_t size = total - framing->body_start - framing->behind + (is_bare ? framing->bare : 0);
+    stream->frame_bytes += total;
+    stream->place += total;
+    return find(stream, frame + framing->body_start, size, read_field(&framing->identifier, frame), found);
+}
+
+/* -- frames of one length without a checksum ------------------------------------------------------------------------
+ *
+ * Only marks are known of them: the trailer of one, the beginning of the next. Values can look like a mark, too, even
+ * in frame after frame, at the same offset. So a step, once found, is kept over damaged marks; it is left for another
+ * offset whose marks go on where its own end; and after lost bytes, the step is found at which the known false marks
+ * are where they were. */
+
+enum {
+    MISSES = 4,    /* a step is kept if one of so many marks is in place */
+    MARKS = 3,     /* beginnings that compete are compared by how many of so many marks follow */
+    SIGHTINGS = 2, /* from so many frames in a row on, a false mark is known */
+    PATIENCE = 16  /* lengths of a frame after which a lost step is forgotten, with its false marks */
+};
+
+/* Whether one frame can end and the next begin, so many bytes behind the place; n_sync bytes follow. */
+static bool is_mark(const struct framing *framing, const struct stream *stream, int64_t at)
+{
+    const uint8_t *begin = stream->bytes + stream->place + at;
+    return ends(framing, begin) && fits(framing->sync, framing->n_sync, begin, framing->n_sync);
+}
+
+/* How many marks follow, frame by frame, up to MARKS. */
+static int64_t run_of(const struct framing *framing, const struct stream *stream, int64_t at)
+{
+    int64_t n = 0;
+    while (n < MARKS && is_mark(framing, stream, at + (n + 1) * framing->longest))
+        n++;
+    return n;
+}
+
+/* Where false marks can be inside a frame. */
+static int64_t first_offset(const struct framing *framing)
+{
+    return framing->n_trailer ? framing->n_trailer : 1;
+}
+
+static int64_t last_offset(const struct framing *framing)
+{
+    return framing->longest - (framing->n_sync ? framing->n_sync : 1);
+}
+
+static bool is_known(const struct stream *stream, int64_t offset)
+{
+    return stream->false_marks[offset] >= SIGHTINGS;
+}
+
+static void forget_false_marks(const struct framing *framing, struct stream *stream)
+{
+    memset(stream->false_marks, 0, (size_t)framing->longest);
+    stream->n_false_marks = 0;
+}
+
+static void note_false_marks(const struct framing *framing, struct stream *stream)
+{
+    stream->n_false_marks = 0;
+    for (int64_t at = first_offset(framing); at <= last_offset(framing); at++) {
+        uint8_t *seen = stream->false_marks + at;
+        *seen = is_mark(framing, stream, at) ? *seen + (*seen < SIGHTINGS) : 0;
+        stream->n_false_marks += is_known(stream, at);
+    }
+}
+
+/* Whether this is a frame and, if it must, is followed by another. */
+static enum verdict form_of(const struct framing *framing, const struct stream *stream, bool is_in_step)
+{
+    const uint8_t *frame = stream->bytes + stream->place;
+    int64_t total = framing->longest, left = stream->size - stream->place;
+    if (!fits(framing->sync, framing->n_sync, frame, left) || !ends(framing, frame + total))
+        return BAD;
+    if (is_in_step && !framing->confirms_each)
+        return GOOD;
+    if (left < total + framing->look_ahead)
+        return INCOMPLETE;
+    return is_mark(framing, stream, total) && (!framing->n_trailer || ends(framing, frame + 2 * total)) ? GOOD : BAD;
+}
+
+/* Whether a frame in step begins at a false mark: its known ones are gone, and a true one is as far behind. */
+static bool has_slipped(const struct framing *framing, const struct stream *stream)
+{
+    int64_t first = first_offset(framing), last = last_offset(framing);
+    bool is_turned = false;
+    for (int64_t at = first; at <= last && stream->n_false_marks; at++) {
+        int64_t behind = framing->longest - at;
+        if (is_known(stream, at) && is_mark(framing, stream, at))
+            return false;
+        is_turned |= is_known(stream, at) && behind >= first && behind <= last && is_mark(framing, stream, behind);
+    }
+    return is_turned;
+}
+
+/* After a frame in step that is none: how far the next one in step is; 0: the step is lost, -1: more must come. */
+static int64_t next_step(const struct framing *framing, struct stream *stream)
+{
+    int64_t total = framing->longest;
+    for (int64_t i = 2; i <= MISSES; i++) {
+        if (stream->size - stream->place < i * total + framing->n_sync)
+            return -1;
+        if (is_mark(framing, stream, i * total))
+            return total;
+    }
+    for (int64_t at = first_offset(framing); at < total; at++)
+        if (is_known(stream, at) && run_of(framing, stream, at) == MARKS) {
+            forget_false_marks(framing, stream);
+            return at;
+        }
+    return 0;
+}
+
+/* Whether a frame begins here, of all places that look so. */
+static enum verdict competes(const struct framing *framing, struct stream *stream)
+{
+    int64_t total = framing->longest, lost = stream->before + stream->place - stream->follows_at;
+    bool is_alone = true;
+    if (stream->n_false_marks && lost > PATIENCE * total)
+        forget_false_marks(framing, stream);
+    for (int64_t at = first_offset(framing); at < total && is_alone; at++)
+        is_alone = !is_mark(framing, stream, at);
+    if (is_alone && !stream->n_false_marks)
+        return GOOD;
+    if (stream->size - stream->place < (MARKS + 1) * total + framing->n_sync)
+        return INCOMPLETE;
+    int64_t run = run_of(framing, stream, 0);
+    for (int64_t at = first_offset(framing); at < total; at++) {
+        bool is_marked = is_mark(framing, stream, at);
+        if (is_known(stream, at) ? !is_marked : is_marked && run_of(framing, stream, at) > run)
+            return BAD;
+    }
+    return GOOD;
+}
+
+static bool find_marked(const struct framing *framing, struct stream *stream, struct found *found)
+{
+    for (;;) {
+        bool is_in_step = stream->before + stream->place == stream->follows_at;
+        int64_t total = framing->longest, further = 0;
+        if (!is_in_step)
+            skip_bytes(stream, beginning(framing, stream) - stream->place);
+        if (stream->size - stream->place < total)
+            return false;
+        enum verdict form = form_of(framing, stream, is_in_step);
+        if (form == GOOD)
+            form = is_in_step ? has_slipped(framing, stream) ? BAD : GOOD : competes(framing, stream);
+        else if (form == BAD && is_in_step)
+            further = next_step(framing, stream);
+        if (form == INCOMPLETE || further < 0)
+            return false;
+        if (form == GOOD) {
+            note_false_marks(framing, stream);
+            stream->follows_at = stream->before + stream->place + total;
+            return take_packet(framing, stream, total, false, found);
+        }
+        stream->bad_form++;
+        skip_bytes(stream, further ? further : 1);
+        if (further)
+            stream->follows_at = stream->before + stream->place;
+    }
+}
+
 static bool find_packet(const struct framing *framing, struct stream *stream, struct found *found)
 {
+    if (framing->look_ahead)
+        return find_marked(framing, stream, found);
     for (;;) {
         skip_bytes(stream, beginning(framing, stream) - stream->place);
         const uint8_t *frame = stream->bytes + stream->place;
@@ -155,17 +312,10 @@ static bool find_packet(const struct framing *framing, struct stream *stream, st
         total = total_of(framing, frame, left, &is_bare);
         if (left < total)
             return false;
-        enum verdict form = total ? form_of(framing, stream, total) : BAD;
-        if (form == INCOMPLETE)
-            return false;
-        if (form == GOOD && (is_bare || has_checksum(framing, frame, total))) {
-            int64_t size = total - framing->body_start - framing->behind + (is_bare ? framing->bare : 0);
-            stream->frame_bytes += total;
-            stream->place += total;
-            stream->follows_at = stream->before + stream->place;
-            return find(stream, frame + framing->body_start, size, read_field(&framing->identifier, frame), found);
-        }
-        *(form == GOOD ? &stream->checksum_errors : &stream->bad_form) += 1;
+        bool has_form = total && ends(framing, frame + total);
+        if (has_form && (is_bare || has_checksum(framing, frame, total)))
+            return take_packet(framing, stream, total, is_bare, found);
+        *(has_form ? &stream->checksum_errors : &stream->bad_form) += 1;
         skip_bytes(stream, 1);
     }
 }

@@ -47,6 +47,8 @@ struct stream {
     uint8_t *bytes, *content; /* room for what may be undecided and a chunk; for what stands between delimiters */
     int64_t size, place, before; /* bytes there are, until where they are decided, bytes before all of them */
     int64_t follows_at, is_discarding, is_behind; /* is_behind: there may be more frames in what has come */
+    uint8_t *false_marks; /* (longest,) at each offset of frames: in how many frames in a row */
+    int64_t n_false_marks;
     struct reading *reads; /* what is not decided yet came then */
     int64_t n_reads;
     const uint8_t *chunk; /* what came last; is_good: a frame was found since, is_damaged: something else was */

@@ -71,7 +71,7 @@ class SerialAdapter(Adapter[OptionsT]):
     def change_framing(self, framing: Framing) -> None:
         """Change to another framing, for devices that report in ``describe`` how long their frames are.
 
-        Bytes that were received and not yet fetched are dropped. ``payload_size`` must allow for the framing from the
+        Bytes that are no whole frame yet count for the new one. ``payload_size`` must allow for the framing from the
         beginning.
         """
         self.framing = framing

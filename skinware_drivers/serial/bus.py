@@ -79,7 +79,7 @@ class SerialBus(KernelBus):
         return self._serial_options.baudrate or self._baudrate
 
     def use(self, framing: Framing, commands: Encoding | None = None, baudrate: int | None = None) -> None:
-        """Set the framing. Bytes that were received but not fetched are dropped.
+        """Set the framing, also of bytes that were received and are no whole frame of the framing before.
 
         Args:
             commands: how they are sent, if in another way.
@@ -87,7 +87,9 @@ class SerialBus(KernelBus):
         """
         self._framing, self._commands = framing, commands or framing
         self._baudrate = baudrate or self._baudrate
-        self._restart()
+        self._restart(*self._stream.rest())
+        if self._port is not None:
+            self._stay_readable(self._stream.is_behind)
 
     def open(self) -> None:
         """Open the port exclusively, raw, with empty buffers."""
@@ -183,9 +185,12 @@ class SerialBus(KernelBus):
     def note(self) -> str:
         return "" if self._port is None else self._port.note
 
-    def _restart(self) -> None:
-        self.counters.framing.skipped_bytes += self._stream.pending
+    def _restart(self, kept: bytes = b"", time_ns: int = 0) -> None:
+        self.counters.framing.skipped_bytes += self._stream.pending - len(kept)
+        self.counters.framing.bytes_in -= len(kept)
         self._stream = stream_of(self._framing, self.payload_size, self.counters)
+        if kept:
+            self._stream.add(kept, time_ns)
         self._judged, self._judged_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
     def _read(self, port: Port) -> None:

@@ -3,9 +3,9 @@
 Wire format, 2,000,000 baud: the makers' firmware, ``32_16_fast.ino`` of FlexiTac/FlexiTac_Hardware_Repo and
 ``template.ino`` of WT-MM/PyFlexiTac: ``AA 55`` and a byte for each cell, row by row, without a pause between frames.
 A frame has no checksum, counter or size, and AA 55 also occurs among the cells: a frame counts only if the next one
-begins right behind it. The board takes no command. The older firmware (``MatrixArray.ino`` of
-binghao-huang/3D-ViTac_Tactile_Hardware) sends text: a line for each row, ``12 0 255`` and a space, and an empty line
-behind each matrix; lines end with 0D 0A.
+begins right behind it, and of places at which AA 55 recurs, one is chosen (``framing.c``). The board takes no command.
+The older firmware (``MatrixArray.ino`` of binghao-huang/3D-ViTac_Tactile_Hardware) sends text: a line for each row,
+``12 0 255`` and a space, and an empty line behind each matrix; lines end with 0D 0A.
 
 The distance from one marker to the next gives the number of cells, and the published sizes give rows and columns.
 Cells of a sound pad rest at 10 to 40 counts (PyFlexiTac), and cells with broken wires read 0 (an issue of the maker's):

@@ -162,8 +162,13 @@ class Framer(ABC):
         return self._before + len(self._rest)
 
     @property
+    def rest(self) -> bytes:
+        """The bytes that may still become part of a frame."""
+        return self._rest
+
+    @property
     def pending(self) -> int:
-        """Bytes that may still become part of a frame."""
+        """The number of those bytes."""
         return len(self._rest)
 
     def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)

@@ -24,6 +24,9 @@ from skinware_drivers.serial.stream import (
     values_of,
 )
 
+_LENGTHS_COMPARED = 4
+"""Frames in which marks are compared (MISSES and MARKS + 1 in ``framing.c``)."""
+
 
 @dataclass(frozen=True)
 class Length:
@@ -78,8 +81,9 @@ class Packet(CompiledFraming):
         header: bytes before the body; default: up to the last of sync, length, identifier and checksum in front.
         confirmed: a frame that does not follow another one at once counts only if the next one begins right behind
             it (and, with a trailer, ends correctly). For devices without a checksum; costs one frame of delay after
-            every fault. ``"each"``: every frame is confirmed in this way; for devices whose frames offer so little to
-            check that a shortened one passes together with the beginning of the next.
+            every fault, and four while values look like a beginning in frame after frame. ``"each"``: every frame is
+            confirmed in this way; for devices whose frames offer so little to check that a shortened one passes
+            together with the beginning of the next.
 
     Raises:
         ConfigurationError: the declaration contradicts itself.
@@ -108,8 +112,8 @@ class Packet(CompiledFraming):
         has_field = isinstance(self.length, LengthTable) and self.length.has_fields
         if (has_field or isinstance(self.length, Length)) and not self.maximum:
             raise ConfigurationError("frames say how long they are: say how long they can be (maximum)")
-        if self.confirmed and not isinstance(self.length, int):
-            raise ConfigurationError("only frames of one length can be confirmed by the next")
+        if self.confirmed and not (isinstance(self.length, int) and self.checksum is None):
+            raise ConfigurationError("only frames of one length, without a checksum, can be confirmed by the next")
         if self.shortest > self.longest or self.shortest < 1:
             raise ConfigurationError(f"the longest frame has {self.longest} bytes, the shortest {self.shortest}")
         most = self.shortest + (self.checksum.size if self.bare_when_empty and self.checksum else 0)
@@ -176,6 +180,12 @@ class Packet(CompiledFraming):
         if not self.confirmed:
             return 0
         return self.longest if self.trailer else len(self.sync)
+
+    @property
+    def undecided(self) -> int:
+        if self.confirmed:
+            return _LENGTHS_COMPARED * self.longest + len(self.sync)
+        return max(self.longest, self.known_from)
 
     def compiled(self, arrays: structs.Arrays) -> structs.Framing:
         compiled = structs.Framing(form=PACKET_FORM, body_start=self.body_start)

@@ -34,7 +34,12 @@ class CompiledFraming(Framing):
 
     Attributes:
         is_first_trusted: the bytes before the first delimiter may be a frame.
+        undecided: bytes that must have come to decide whether a frame begins, at most.
     """
+
+    @property
+    def undecided(self) -> int:
+        return 0
 
     @property
     def is_first_trusted(self) -> bool:
@@ -127,6 +132,10 @@ class Stream(ABC):
     def pending(self) -> int:
         """Bytes that may still become part of a frame."""
 
+    @abstractmethod
+    def rest(self) -> tuple[bytes, int]:
+        """Return the bytes that are pending, the last ``CHUNK`` at most, and when the last of them was read."""
+
     def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)
         """Note that the host sends a question."""
 
@@ -154,13 +163,14 @@ class NativeStream(Stream):
         self._fill.restype = ctypes.c_int64
         self._arrays = arrays = structs.Arrays()
         compiled = framing.compiled(arrays)
-        undecided = max(compiled.longest + compiled.look_ahead, compiled.known_from, compiled.longest_segment)
+        undecided = max(framing.undecided, compiled.longest_segment)
         self._stream = structs.Stream(
             framing=arrays.structs(structs.Framing, [compiled])[1],
             payload_size=payload_size,
             bytes=arrays.at(np.zeros(undecided + CHUNK, np.uint8)),
             content=arrays.at(np.zeros(compiled.longest_segment + 1, np.uint8)),
             reads=arrays.at(np.zeros((undecided + 2, 2), np.int64)),
+            false_marks=arrays.at(np.zeros(max(1, compiled.longest), np.uint8)),
             follows_at=-1,
             is_discarding=not framing.is_first_trusted,
             frames=counters.frames,
@@ -178,6 +188,13 @@ class NativeStream(Stream):
     @property
     def pending(self) -> int:
         return int(self._stream.size - self._stream.place)
+
+    def rest(self) -> tuple[bytes, int]:
+        stream, size = self._stream, min(self.pending, CHUNK)
+        if not size:
+            return b"", 0
+        last = structs.Reading.from_address(stream.reads + ctypes.sizeof(structs.Reading) * (stream.n_reads - 1))
+        return ctypes.string_at(stream.bytes + stream.size - size, size), last.time_ns
 
     @property
     def judged(self) -> int:
@@ -283,6 +300,9 @@ class PythonStream(Stream):
     @property
     def pending(self) -> int:
         return self._framer.pending
+
+    def rest(self) -> tuple[bytes, int]:
+        return self._framer.rest[-CHUNK:], self._reads[-1][1] if self._reads else 0
 
     def asked(self) -> None:
         self._framer.asked()

@@ -49,7 +49,7 @@ def held_at_most(framer: Framer) -> int:
     if framing is None:  # that of C, whose room the sanitizers see
         return 1 << 62
     if isinstance(framing, Packet):
-        return 2 * framing.longest + len(framing.sync)
+        return framing.undecided
     if isinstance(framing, Recurring):
         return 3 * (len(framing.marker) + framing.maximum_body) + len(framing.marker)
     if isinstance(framing, TextMatrix):

@@ -38,15 +38,19 @@ def found(stream: bytes, **options: Any) -> list[tuple[int, bytes]]:
 
 def test_records_among_text() -> None:
     """The last record before text, which nothing confirms, is not shown."""
-    stream = b"Port 0:\r\n Starting data stream\r\n" + record(0) + record(4) + record(0) + b"Biasing...\r\n" + record(1)
-    assert found(stream + record(2)) == [(0, BODY), (4, BODY), (1, BODY)]
+    stream = b"Port 0:\r\n Starting data stream\r\n" + record(0) + record(4) + record(0) + b"Biasing...\r\n"
+    assert found(stream + record(1) + record(2) * 4)[:3] == [(0, BODY), (4, BODY), (1, BODY)]
 
 
 def test_what_is_no_record() -> None:
     for at, byte in ((0, 5), (1, 1), (8, 0x00), (9, 0x06), (11, 1)):
         bad = bytearray(record(0))
         bad[at] = byte
-        assert found(record(0) + record(1) + bytes(bad) + record(2) + record(3)) == [(0, BODY), (2, BODY)]
+        assert found(record(0) + record(1) + bytes(bad) + record(2) + record(3) * 2) == [
+            (0, BODY),
+            (2, BODY),
+            (3, BODY),
+        ]
 
 
 def test_forces_alone() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from skinware_drivers.serial.framings import Recurring, TextMatrix
 from skinware_drivers.serial.packets import Packet
 from skinware_drivers.testing.driving import emulated_on_a_pty, emulated_skin
 from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.virtual import Device
 from skinware_drivers.virtual.devices.flexitac import EmulatedFlexiTac, EmulatedFlexiTacOptions
-from tests.sdk.driving import driving_lines, read_until
+from tests.sdk.driving import driving_lines, read_until, restarted_on_demand
 from tests.serial.lines import line
 from tests.serial.spoken import Spoken
 from tests.serial.streams import cut, outcome
@@ -61,11 +63,12 @@ def test_emulated_text_firmware() -> None:
 def test_a_frame_counts_if_the_next_begins_right_behind_it() -> None:
     """Markers among the cells change nothing; a frame that lost cells, or was joined halfway, is not shown."""
     framing = Packet(sync=MARKER, length=18, confirmed="each")
-    cells = [bytes([n]) * 5 + MARKER + bytes([n]) * 9 for n in range(6)]
+    cells = [bytes([n]) * 5 + MARKER + bytes([n]) * 9 for n in range(9)]
     frames = [MARKER + body for body in cells]
     assert found(framing, b"".join(frames)) == cells[:-1]
     assert found(framing, frames[0][9:] + b"".join(frames[1:])) == cells[1:-1]
-    assert found(framing, b"".join(frames[:2]) + frames[2][:10] + b"".join(frames[3:])) == [*cells[:2], *cells[3:-1]]
+    cut_one = b"".join(frames[:2]) + frames[2][:10] + b"".join(frames[3:])
+    assert found(framing, cut_one + frames[0]) == [*cells[:2], *cells[3:]]
 
 
 def test_the_length_of_frames_is_heard() -> None:
@@ -225,3 +228,23 @@ def test_it_comes_back_after_a_reset() -> None:
 def test_sizes_that_cannot_be(size: str) -> None:
     with pytest.raises(ConfigurationError, match="size"):
         FlexiTacOptions(size=size)
+
+
+def test_cells_that_look_like_the_marker() -> None:
+    """All the time, also over lost bytes and restarts: no matrix is shown shifted."""
+
+    class Alike(EmulatedFlexiTac):
+        def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
+            cells = [*values]
+            cells[100:102] = MARKER
+            return super().messages(device, cells)
+
+    devices = restarted_on_demand(Alike)
+    faults: dict[str, Any] = {"lose": 0.02, "truncate": 0.02, "repeat": 0.02}
+    with emulated_skin(FlexiTacDriver, devices, pattern="cycle", boot_s=0.3, **faults) as skin:
+        for number in range(60):
+            devices.restart_now = number % 20 == 19
+            frame = read_until(skin.reader, lambda f: not (f.status & (Status.STALE | Status.NEVER_SEEN)).any())
+            values = frame.values.tolist()
+            assert values[100:102] == [*MARKER]
+            assert len(set(values[:100] + values[102:])) == 1

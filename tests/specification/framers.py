@@ -13,6 +13,9 @@ from skinware_drivers.serial.packets import Length, LengthTable, Packet
 from skinware_drivers.serial.stream import values_of
 
 _GOOD, _REFUSED, _INCOMPLETE = range(3)
+_MISSES, _MARKS, _SIGHTINGS, _PATIENCE = 4, 3, 2, 16
+"""A step is kept if one of so many marks is in place; beginnings that compete are compared by how many of so many marks
+follow; from so many frames in a row on, a false mark is known; lengths after which a lost step is forgotten."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +51,12 @@ class PacketFramer(Framer):
         self._bare = framing.checksum.size if framing.bare_when_empty and framing.checksum else 0
         self._checksum_at = framing.checksum_place(0)  # from the end, if negative
         self._covered_from, self._covered_to = framing.covered(0)  # from the beginning, and from the end
-        self._confirms_each = framing.confirmed == "each"
-        self._follows_at = -1  # place in the stream at which a frame would follow the last one at once
+        self._follows_at = -1  # place in the stream of the next frame in step
+        self._seen: dict[int, int] = {}  # false marks: at each offset, in how many frames in a row
 
     def _find(self, stream: bytes) -> tuple[list[Framed], int]:
         found: list[tuple[int, int, bool]] = []
-        done = self._search(stream, 0, found)
+        done = (self._search_marked if self._look_ahead else self._search)(stream, 0, found)
         framing, field = self._framing, self._framing.identifier
         first, behind, bare = framing.body_start, framing.behind, self._bare
         return [
@@ -76,21 +79,15 @@ class PacketFramer(Framer):
             if size - place < self._known_from or place == size:
                 return place
             total, is_bare = self._total(stream, place)
-            follows = not self._look_ahead or (not self._confirms_each and self._before + place == self._follows_at)
             if total:
                 if size - place < total:
                     self._wanted = total
                     return place
-                form = self._form(stream, place, total, follows)
-                if form == _INCOMPLETE:
-                    self._wanted = total + self._look_ahead
-                    return place
-                if form == _GOOD:
+                if self._ends(stream, place + total):
                     if is_bare or self._has_checksum(stream, place, total):
                         counters.frame_bytes += total
                         found.append((place, total, is_bare))
                         place += total
-                        self._follows_at = self._before + place
                         continue
                     counters.checksum_errors += 1
                 else:
@@ -116,18 +113,111 @@ class PacketFramer(Framer):
             total = says + length.more - (self._bare if is_bare else 0)
         return (total if framing.shortest <= total <= framing.longest else 0), is_bare
 
-    def _form(self, stream: bytes, place: int, total: int, follows: bool) -> int:
-        """Judge the trailer of the frame and, unless it follows another one, the beginning of the next."""
+    def _search_marked(self, stream: bytes, place: int, found: list[tuple[int, int, bool]]) -> int:
+        """Do so for frames of one length without a checksum, of which only the marks between them are known."""
+        counters, total = self.counters, self._framing.longest
+        while True:
+            is_in_step = self._before + place == self._follows_at
+            if not is_in_step:
+                match = self._begin.search(stream, place)
+                begin = len(stream) if match is None else match.start()
+                counters.skipped_bytes += begin - place
+                place = begin
+            if len(stream) - place < total:
+                return place
+            form, further = self._form(stream, place, is_in_step), 0
+            if form == _GOOD:
+                form = self._has_slipped(stream, place) if is_in_step else self._competes(stream, place)
+            elif form == _REFUSED and is_in_step:
+                further = self._next_step(stream, place)
+            if form == _INCOMPLETE or further < 0:
+                return place
+            if form == _GOOD:
+                self._seen = {at: self._seen.get(at, 0) + 1 for at in self._false_marks(stream, place)}
+                counters.frame_bytes += total
+                found.append((place, total, False))
+                place += total
+                self._follows_at = self._before + place
+                continue
+            counters.refused += 1
+            counters.skipped_bytes += further or 1
+            place += further or 1
+            if further:
+                self._follows_at = self._before + place
+
+    @property
+    def _offsets(self) -> range:
+        """Offsets in a frame at which a false mark can be."""
+        return range(len(self._framing.trailer) or 1, self._framing.longest)
+
+    def _false_marks(self, stream: bytes, place: int) -> set[int]:
+        """Return the offsets of marks inside a frame."""
+        last = self._framing.longest - (len(self._framing.sync) or 1)
+        return {at for at in self._offsets if at <= last and self._is_mark(stream, place + at)}
+
+    @property
+    def _known(self) -> list[int]:
+        """Offsets of known false marks."""
+        return [at for at, frames in self._seen.items() if frames >= _SIGHTINGS]
+
+    def _ends(self, stream: bytes, end: int) -> bool:
         n = len(self._framing.trailer)
-        if n and not self._whole_trailer.match(stream, place + total - n):
+        return not n or self._whole_trailer.match(stream, end - n) is not None
+
+    def _is_mark(self, stream: bytes, place: int) -> bool:
+        return self._ends(stream, place) and self._whole_sync.match(stream, place) is not None
+
+    def _run(self, stream: bytes, place: int) -> int:
+        """Return how many marks follow, frame by frame."""
+        steps = range(1, _MARKS + 1)
+        return next((n - 1 for n in steps if not self._is_mark(stream, place + n * self._framing.longest)), _MARKS)
+
+    def _form(self, stream: bytes, place: int, is_in_step: bool) -> int:
+        """Judge a frame and, if it needs one, the next."""
+        total = self._framing.longest
+        if not self._whole_sync.match(stream, place) or not self._ends(stream, place + total):
             return _REFUSED
-        if follows:
+        if is_in_step and self._framing.confirmed != "each":
             return _GOOD
         if len(stream) - place < total + self._look_ahead:
             return _INCOMPLETE
-        if not self._whole_sync.match(stream, place + total):
+        is_followed = self._is_mark(stream, place + total)
+        return _GOOD if is_followed and self._ends(stream, place + 2 * total) else _REFUSED
+
+    def _has_slipped(self, stream: bytes, place: int) -> int:
+        """Refuse a frame in step that begins at a false mark: known ones are gone, a true one is as far behind."""
+        marks, known = self._false_marks(stream, place), set(self._known)
+        is_turned = any(self._framing.longest - at in marks for at in known)
+        return _REFUSED if is_turned and not known & marks else _GOOD
+
+    def _next_step(self, stream: bytes, place: int) -> int:
+        """Return how far the next frame in step is; 0: the step is lost, -1: more bytes must come."""
+        total = self._framing.longest
+        for n in range(2, _MISSES + 1):
+            if len(stream) - place < n * total + len(self._framing.sync):
+                return -1
+            if self._is_mark(stream, place + n * total):
+                return total
+        for at in self._known:
+            if self._run(stream, place + at) == _MARKS:
+                self._seen = {}
+                return at
+        return 0
+
+    def _competes(self, stream: bytes, place: int) -> int:
+        """Judge a beginning among all the places that look like one."""
+        total = self._framing.longest
+        if self._before + place - self._follows_at > _PATIENCE * total:
+            self._seen = {} if self._known else self._seen
+        known, rivals = self._known, [at for at in self._offsets if self._is_mark(stream, place + at)]
+        if not known and not rivals:
+            return _GOOD
+        if len(stream) - place < (_MARKS + 1) * total + len(self._framing.sync):
+            return _INCOMPLETE
+        if not set(known) <= set(rivals):
             return _REFUSED
-        return _GOOD if not n or self._whole_trailer.match(stream, place + 2 * total - n) else _REFUSED
+        run = max((self._run(stream, place + at) for at in set(rivals) - set(known)), default=0)
+        return _GOOD if run <= self._run(stream, place) else _REFUSED
 
     def _has_checksum(self, stream: bytes, place: int, total: int) -> bool:
         checksum = self._framing.checksum

@@ -55,6 +55,10 @@ class BothStreams(Stream):
     def pending(self) -> int:
         return self._python.pending
 
+    def rest(self) -> tuple[bytes, int]:
+        self._compare("holds back", self._python.rest(), self._native.rest())
+        return self._python.rest()
+
     def add(self, chunk: bytes, time_ns: int) -> None:
         self._python.add(chunk, time_ns)
         self._native.add(chunk, time_ns)

@@ -118,6 +118,14 @@ def test_it_does_not_ask_faster_than_a_serial_line_can_answer() -> None:
     assert period_s("modbus:/dev/null", period_ms=10) == 0.01
 
 
+def test_an_untouched_hand_has_hardly_any_load_and_no_dead_matrix() -> None:
+    shapes = [module.kind.split("x") for module in adapter().patches[0].modules]
+    ends = np.cumsum([int(rows) * int(columns) for rows, columns in shapes])[:-1]
+    matrices = np.split(np.array(EmulatedInspire.rest), ends)
+    assert [matrix.any() for matrix in matrices] == [True] * 17
+    assert max(matrix.sum() for matrix in matrices) < 10
+
+
 # What it means
 
 

@@ -2,7 +2,8 @@
 
 Sources, with the vectors in tests/modbus:
 
-* RH56DFTP, whose addresses count bytes: the maker's manual PRJ-02-TS-U-010 V1.0.0.
+* RH56DFTP, whose addresses count bytes: the maker's manual PRJ-02-TS-U-010 V1.0.0. Untouched, a good matrix of an
+  owner's hand is not all 0 (AlexArutiunian/tactile-rh56dftp 8eb83a3, 2026-05-15); how far from it is not published.
 * SEN0704 and SEN0705: DFRobot/DFRobot_TactileSensor.
 * Revo2 in one of its four editions: the registers that the maker's program bc_stark_sdk 2.0.8 reads and writes.
 * Revo3, with registers in the three mappings that its maker's programs read: BrainCoTech/brainco-revo3-sdk 7ba96eb
@@ -33,6 +34,8 @@ _THUMB = ((3, 3), (12, 8), (3, 3), (12, 8))
 _PALM = (8, 14)
 _SHAPES = (*_FINGER * 4, *_THUMB, _PALM)
 """Rows and columns, in the order of the registers: little, ring, middle, index finger, thumb, palm."""
+_AT_REST = tuple(4 * (not place) for rows, columns in _SHAPES for place in range(rows * columns))
+"""One taxel of each matrix is not at 0."""
 
 
 class EmulatedInspireOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -45,7 +48,7 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
     """One hand. Values: those of the taxels, matrix by matrix, each row by row."""
 
     full_scale = 4096
-    rest = 12
+    rest = _AT_REST
     swing = 3000
     speed_mbit_s = 100
     step = 2

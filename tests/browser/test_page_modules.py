@@ -308,8 +308,8 @@ def test_a_spectrum_has_the_amplitude_at_its_frequency(tell: Callable[..., Any])
 
 def test_figures(tell: Callable[..., Any]) -> None:
     assert tell("format.js", "[null, NaN].map(m.age)") == [NONE, NONE]
-    figures = "[0, 1.23456, -120345.6, 1.5e-7, 2.5e9, undefined].map(m.figure)"
-    assert tell("format.js", figures) == ["0", "1.235", "-120300", "1.50e-7", "2.50e+9", NONE]
+    figures = "[0, 1.23456, -120345.6, 1.5e-7, 12345678, 2.5e9, undefined].map(m.figure)"
+    assert tell("format.js", figures) == ["0", "1.235", "-120300", "1.50e-7", "12350000", "2.50e+9", NONE]
     assert tell("format.js", "[999, 1234, 4.2e7, 5e12, 9e15].map(m.bytes)") == [
         "999 B",
         "1.2 kB",

@@ -31,7 +31,7 @@ export function percent(part) {
 /** A number with about four digits. */
 export function figure(x) {
   if (!isKnown(x)) return NONE;
-  if (x !== 0 && (Math.abs(x) >= 1e6 || Math.abs(x) < 1e-3)) return x.toExponential(2);
+  if (x !== 0 && (Math.abs(x) >= 1e8 || Math.abs(x) < 1e-3)) return x.toExponential(2);
   return String(Number(x.toPrecision(4)));
 }
 

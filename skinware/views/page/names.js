@@ -8,6 +8,7 @@ const LINE = 14; // pixels
 const [FADED, WHOLE] = [0.8, 1.3]; // size of a part, in widths of its name, at which that is not seen yet, and is seen whole
 const NUMBERED = 3; // times that size for one of many, "triangle 4", whose neighbours its name would cover
 const LINES = [0, 1, 2, 3, 4, -1, -2]; // that a name may stand higher to be free, or lower
+const LEAST_SHARE = 0.01; // of the scale, from which a load is in its name
 const CORNERS = Array.from({ length: 8 }, (_, k) => [k & 1, (k >> 1) & 1, k >> 2]);
 const ruler = document.createElement("canvas").getContext("2d");
 const widths = new Map();
@@ -103,7 +104,8 @@ export class Names {
       const middle = xs.reduce((sum, x) => sum + x, 0) / 8;
       const top = Math.max(Math.min(...ys) - LINE / 2, LINE / 2 + 2);
       const alpha = Math.min(1, (pixels / (times * widthOf(part.name)) - FADED) / (WHOLE - FADED));
-      const whole = part.load && (part.size || alpha === 1) ? [`${part.name}  ${measure(part.load, part.sheet.unit)}`] : [];
+      const isSeen = part.load > LEAST_SHARE * (part.sheet.shown.scale[1] - part.sheet.shown.scale[0]);
+      const whole = isSeen && (part.size || alpha === 1) ? [`${part.name}  ${measure(part.load, part.sheet.unit)}`] : [];
       const lines = part.size ? LINES : [0];
       for (const [text, line] of [...whole, part.name].flatMap((text) => lines.map((line) => [text, line]))) {
         const width = widthOf(text);

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from skinware.geometry import Geometry, Triple
-from skinware.nominal_hand import PARTS, Side, frame_of
+from skinware.nominal_hand import NominalHand
 
 PITCH_M = 0.002
 """Distance of taxels if the maker publishes none, m."""
@@ -83,14 +83,27 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Hand:
-    """A nominal hand.
+class Hand(NominalHand):
+    """A nominal hand with places for grids."""
 
-    Attributes:
-        side: of the body; a left hand mirrors a right one.
-    """
+    def place(self, part: str, from_end_m: float, aside_m: float = 0.0) -> Place:
+        """Return a place on the middle line of a finger, or of the palm, with its tip up.
 
-    side: Side = "right"
+        Args:
+            part: a finger, or ``palm``.
+            from_end_m: distance from its upper end.
+            aside_m: from the middle line to the right, as a person sees the palm of a right hand.
+
+        Raises:
+            ValueError: no such part.
+        """
+        if part not in self.parts:
+            raise ValueError(f"a {self.build} has no part {part!r}; it has {', '.join(self.parts)}")
+        (x, y), turned = self.parts[part].end, self.parts[part].turned_rad
+        mirrored = 1 if self.side == "right" else -1
+        x += from_end_m * math.sin(turned) + aside_m * math.cos(turned)
+        y += aside_m * math.sin(turned) - from_end_m * math.cos(turned)
+        return Place(self.frame, (mirrored * x, y, 0.0), mirrored * turned)
 
     def down(self, part: str, grids: Sequence[Grid]) -> list[Place]:
         """Return the places of grids that follow each other from the upper end of a finger, or of the palm, down.
@@ -102,15 +115,9 @@ class Hand:
         Raises:
             ValueError: no such part.
         """
-        if part not in PARTS:
-            raise ValueError(f"a hand has no part {part!r}; it has {', '.join(PARTS)}")
-        (x, y), turned = PARTS[part].end, PARTS[part].turned_rad
-        mirrored = 1 if self.side == "right" else -1
         places, passed = [], 0.0
         for grid in grids:
             height = grid.rows * grid.pitch_m
-            away = passed + height / 2
-            centre = (mirrored * (x + away * math.sin(turned)), y - away * math.cos(turned), 0.0)
-            places.append(Place(frame_of(self.side), centre, mirrored * turned))
+            places.append(self.place(part, passed + height / 2))
             passed += height + _GAP_M
         return places

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
@@ -13,7 +14,7 @@ import numpy.typing as npt
 from skinware._columns import Index
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.geometry import Geometry
-from skinware.nominal_hand import PARTS, parts_at, side_of
+from skinware.nominal_hand import PARTS, NominalHand
 from skinware.sensor_types import (
     ACCELERATION,
     ANGULAR_RATE,
@@ -95,11 +96,14 @@ class Quantity:
             return "highest"
         return "sum" if self.type.unit.endswith("N") or self.type.id in _NORMAL else None
 
+    @property
+    def is_count(self) -> bool:
+        return not self.type.unit.endswith(("N", "Pa"))
+
     @cached_property
     def has_loads(self) -> bool:
-        """Whether ``total`` of its values is a load: of counts only on a hand, where untouched taxels have none."""
-        is_count = not self.type.unit.endswith(("N", "Pa"))
-        return self.total is not None and (not is_count or bool(self.pads.is_on_hand[self.where].all()))
+        """Whether ``total`` of its values is a load: of counts only on a hand, where taxels rest at the least."""
+        return self.total is not None and (not self.is_count or bool(self.pads.is_on_hand[self.where].all()))
 
     def totals(self, loads: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.float64]:
         """Return (k, n_pads) the load on each pad from (k, n) loads of its taxels, 0 or more where there are none."""
@@ -186,10 +190,10 @@ def pads_of(structure: Structure) -> Pads:
     part = np.full(structure.n_sensors, -1)
     geometry = structure.geometry
     for frame in () if geometry is None else set(geometry.frame[geometry.known].tolist()):
-        side = side_of(frame)
-        if geometry is not None and side is not None:
+        hand = NominalHand.in_frame(frame)
+        if geometry is not None and hand is not None:
             here = geometry.known & (geometry.frame == frame)
-            part[here] = parts_at(geometry.position_m[here], side)
+            part[here] = hand.parts_at(geometry.position_m[here])
     module = structure.sensor_module.astype(np.int64)
     least, most = np.full(structure.n_modules, len(PARTS)), np.full(structure.n_modules, -1)
     np.minimum.at(least, module[part >= 0], part[part >= 0])
@@ -329,7 +333,7 @@ class Newest:
         """Return (k, n_pads) the load on each pad in each of ``all``, the sum or the highest of its values.
 
         Args:
-            rest: (n_sensors,) values at rest that are taken off; None: none are.
+            rest: (n_sensors,) values at rest that are taken off; None: of counts the least of their type.
 
         Returns:
             None where values are no loads: counts, but on a hand or beside a calmed driver, and other quantities.
@@ -339,5 +343,7 @@ class Newest:
         loads = np.stack([frame.physical(quantity.type.name) for frame in self.all])
         if self.calm is None and rest is not None:
             loads -= rest[quantity.where]
+        elif self.calm is None and quantity.is_count and math.isfinite(quantity.type.minimum):
+            loads -= loads.dtype.type(quantity.type.minimum)
         without = np.stack([frame.status[quantity.where] for frame in self.all]) & WITHOUT_VALUE
         return quantity.totals(np.where(without == 0, np.nan_to_num(loads), 0))

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from skinware.geometry import Geometry
 from skinware.matrices import filled_by
-from skinware.nominal_hand import PARTS, outline, parts_at, side_of
+from skinware.nominal_hand import PARTS, NominalHand
 from skinware.structure import Structure
 from skinware.views.quantities import Quantity
 
@@ -161,10 +161,10 @@ class Scene:
     def _arrange_bodies(self, bodies: Sequence[_Body]) -> None:
         for body in sorted(bodies, key=lambda body: not self._is_placed(body)):
             pose = self._poses.get(body.frame, np.eye(4)).copy()
-            side, outlines = side_of(body.frame), []
-            if side is not None:  # the parts of a nominal hand on which the taxels are, and the palm
-                parts = {*parts_at(body.at, side).tolist(), len(PARTS) - 1}
-                outlines = [outline(name, side) for number, name in enumerate(PARTS) if number in parts]
+            hand, outlines = NominalHand.in_frame(body.frame), []
+            if hand is not None:  # the parts of a nominal hand on which the taxels are, and the palm
+                parts = {*hand.parts_at(body.at).tolist(), len(PARTS) - 1}
+                outlines = [hand.outline(name) for number, name in enumerate(PARTS) if number in parts]
             self._outlines |= {(driver, body.frame): outlines for driver in body.drivers if outlines}
             places = np.concatenate([body.at, *outlines])
             corners = np.array(np.meshgrid(*zip(places.min(axis=0), places.max(axis=0), strict=True))).reshape(3, -1)

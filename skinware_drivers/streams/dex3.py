@@ -5,6 +5,10 @@ commit 21d0a3b (2026-07-09), ``idl/hg`` and ``example/g1/dex3``; the maker's pag
 There are two editions of the type: ``PressSensorState_`` had no ``lost`` before, and has none in unitree_sdk2_python,
 commit bddc17a. DDS shows both by the same name.
 
+The maker publishes no places of pads and taxels. Owners found them by touch: Skvayzer/unitree_sim_isaaclab, commit
+9e881f2 (2026-04-26), the pads of both hands; sri299792458/dex3_pressure_tools, commit e0b706d (2026-06-25), the pads of
+a right hand, its taxels after a figure, and that only 33 of its 108 taxels have readings, which lie 10 to 12 mm apart.
+
 A sample has fixed places for seven motors and a known number of pads: u32 7, seven motors of 56 bytes, u32 9, the pads,
 and the rest with the quaternion of an IMU first. A pad is 12 pressures and 12 temperatures, float32, and ``lost`` and
 ``reserve``, u32. It becomes a frame for each pad: time u32, the values, a number u32 that counts samples and what the
@@ -22,11 +26,13 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
+from skinware.geometry import Geometry
 from skinware.ros_types import Definitions
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, taxels
 from skinware_drivers.fields import Bits, Identifier, Match, SequenceNumber, StatusBytes
+from skinware_drivers.hand import Grid, Hand
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
@@ -36,7 +42,7 @@ from skinware_drivers.serial.framing import Framing
 from skinware_drivers.serial.framings import Split
 from skinware_drivers.streams.dds import ENCAPSULATION, SOURCE_TIME, DdsAdapter, DdsTopic, samples
 
-_SIDES = ("left", "right")
+_SIDES: tuple[Literal["left", "right"], ...] = ("left", "right")
 _STATE = "unitree_hg/msg/HandState"
 _TEXTS = {
     "unitree_hg/MotorState": (
@@ -58,6 +64,15 @@ _EDITIONS = Definitions(_STATE, _TEXTS), Definitions(_STATE, _TEXTS | _OLD_PAD)
 _BEGINNINGS = {"full": "rt/dex3", "low": "rt/lf/dex3"}
 
 _MOTORS, _TAXELS, _MOST_PADS = 7, 12, 16
+_FINGERS = ("thumb pad", "thumb tip", "middle pad", "middle tip", "index pad", "index tip")
+_PALM = ("palm middle", "palm centre", "palm index")
+"""The pads of the palm, by the finger that is nearest."""
+_PADS_OF = {"left": (*_FINGERS, *reversed(_PALM)), "right": (*_FINGERS, *_PALM)}
+_FROM_END_M = {"tip": 0.018, "pad": 0.059}
+_ASIDE_M = {"palm middle": -0.026, "palm centre": 0.0, "palm index": 0.026}
+_BELOW_FINGERS_M = 0.0105
+_ON_FINGER, _ON_PALM = Grid(4, 3, 0.004), Grid(3, 4, 0.004)
+_CELLS = np.arange(_TAXELS)
 _LITTLE_ENDIAN = (b"\0\1", b"\0\7")
 """Encapsulations: plain CDR of version 1 and 2, which are the same for these types."""
 _MOTORS_END = ENCAPSULATION + 4 + 56 * _MOTORS
@@ -96,7 +111,7 @@ class Dex3Options(Options, frozen=True):
     ] = "full"
     pads: Annotated[int, Meta(ge=1, le=_MOST_PADS, description="pads of a hand; others are not shown")] = 9
     names: Annotated[
-        tuple[str, ...], Meta(description="names of pads, as 0=thumb tip: which pad is where is not published")
+        tuple[str, ...], Meta(description="names of pads, as 0=thumb tip, where a hand differs from those of owners")
     ] = ()
     period_ms: Annotated[float, Meta(ge=1, le=10_000, description="nominal time between two samples, ms")] = 2
 
@@ -118,13 +133,19 @@ class Dex3Options(Options, frozen=True):
             named[int(number)] = name.strip()
         return named
 
+    def names_of(self, side: Literal["left", "right"]) -> list[str]:
+        """Return the names of a hand's pads: those that are given, and others as owners found them."""
+        named = self.named()
+        known = {pad: name for pad, name in enumerate(_PADS_OF[side]) if name not in named.values()}
+        return [named.get(pad) or known.get(pad) or f"pad {pad}" for pad in range(self.pads)]
+
 
 class Dex3Driver(DdsAdapter[Dex3Options]):
     """One or two hands; uid = hand << 8 | pad << 4 | taxel, of both pressure and temperature."""
 
     topics: Sequence[DdsTopic] = [topic for beginning in _BEGINNINGS.values() for topic in _topics(beginning, _SIDES)]
     types: Sequence[SensorType] = (
-        PRESSURE.measured(unit="counts", minimum=0.0),
+        PRESSURE.measured(unit="counts", minimum=_LEAST_VALID),
         TEMPERATURE.measured(unit="counts"),
     )
     dtype: npt.DTypeLike = np.float32
@@ -156,6 +177,7 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         self._numbers = np.zeros((len(_SIDES), options.pads), np.int64)
         self._totals = np.zeros((len(_SIDES), options.pads), np.int64)
         self._described: Sequence[Patch] = ()
+        self.geometry: Geometry | None = None
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Return the hands of the options, or those that are heard.
@@ -170,7 +192,9 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         hands = {_SIDES.index(side) for side in _SIDES if self.options.hands in (side, "both")}
         if not hands:
             hands = await self._heard(link) | {patch.key for patch in known}
-        named = self.options.named()
+        names = {hand: self.options.names_of(_SIDES[hand]) for hand in sorted(hands)}
+        places = [place for hand, of_hand in names.items() for place in _nominal(hand, of_hand)]
+        self.geometry = Geometry.joined(places) if places else None
         self._described = [
             Patch(
                 f"{_SIDES[hand]} hand",
@@ -181,14 +205,14 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
                             *taxels(_TAXELS, "temperature", first_uid=hand << 8 | pad << 4),
                         ],
                         key=pad,
-                        kind="3x4",
-                        name=named.get(pad, f"pad {pad}"),
+                        kind="3x4" if name in _PALM else "4x3",
+                        name=name,
                     )
-                    for pad in range(self.options.pads)
+                    for pad, name in enumerate(of_hand)
                 ],
                 key=hand,
             )
-            for hand in sorted(hands)
+            for hand, of_hand in names.items()
         ]
         return self._described
 
@@ -274,6 +298,24 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         for pad in np.flatnonzero((more > 0) & (self._totals[hand] == more)).tolist():
             self.log_once(f"{_SIDES[hand]} hand: pad {pad} loses data (logged once)")
         return more
+
+
+def _nominal(hand: int, names: Sequence[str]) -> list[Geometry]:
+    """Return nominal places of the pads whose names say where they are."""
+    of_side, places = Hand(_SIDES[hand], "claw"), []
+    for pad, name in enumerate(names):
+        if name in _ASIDE_M:
+            place, grid = of_side.place("palm", _BELOW_FINGERS_M, _ASIDE_M[name]), _ON_PALM
+            cells = 4 * (_CELLS % 3) + 3 - _CELLS // 3  # by columns, from the upper right
+        elif name in _FINGERS:
+            finger, part = name.split()
+            place, grid = of_side.place(finger, _FROM_END_M[part]), _ON_FINGER
+            cells = _CELLS if part == "tip" else _CELLS[::-1]
+        else:
+            continue
+        uids = hand << 8 | pad << 4 | _CELLS
+        places.append(grid.at(place, ["pressure", "temperature"], uids.tolist(), cells.tolist()))
+    return places
 
 
 def _status(pads: npt.NDArray[np.void]) -> npt.NDArray[np.uint8]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skinware.geometry import Geometry
-from skinware.nominal_hand import FINGERS
+from skinware.nominal_hand import FINGERS, PARTS
 from skinware_drivers.hand import Grid, Hand, Place
 
 
@@ -64,3 +64,16 @@ def test_the_thumb_of_a_right_hand_is_right_and_a_left_hand_is_mirrored() -> Non
 def test_a_part_that_no_hand_has_is_refused() -> None:
     with pytest.raises(ValueError, match="no part 'toe'; it has thumb, index, middle, ring, little, palm"):
         Hand().down("toe", [Grid(1, 1)])
+
+
+def test_a_claw_has_two_fingers_opposite_to_a_thumb() -> None:
+    claw = Hand("left", "claw")
+    assert tuple(claw.parts) == ("thumb", "index", "middle", "palm")
+    assert Hand.in_frame("left_claw_nominal 2") == claw
+    centres = np.array([claw.place(part, 0.02).centre_m for part in claw.parts])
+    assert [PARTS[part] for part in claw.parts_at(centres)] == list(claw.parts)
+    thumb, index, middle, _ = centres
+    assert index[0] < thumb[0] < middle[0]
+    assert thumb[1] < index[1] == middle[1]
+    with pytest.raises(ValueError, match="a claw has no part 'ring'; it has thumb, index, middle, palm"):
+        claw.place("ring", 0.01)

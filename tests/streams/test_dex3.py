@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from skinware import DriverReader, DriverSnapshot, Namespace
 from skinware.errors import ConfigurationError, MissingExtra
 from skinware.status import BusState, Status
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.link import Link
 from skinware_drivers.registry import make_bus
 from skinware_drivers.streams import dds
 from skinware_drivers.streams.dds import DdsBus, record, samples
@@ -81,7 +83,7 @@ def test_both_hands_value_by_value(domain: int) -> None:
         frame = read_until(skin.reader, is_good)
         structure = frame.structure
         assert structure.patch_name.tolist() == [b"left hand", b"right hand"]
-        assert structure.module_name.tolist()[:2] == [b"pad 0", b"pad 1"]
+        assert structure.module_name.tolist()[:2] == [b"thumb pad", b"thumb tip"]
         assert len(structure.sensor_uid) == 2 * N
         assert [(kind.name, kind.unit) for kind in structure.types] == [
             ("pressure", "counts"),
@@ -266,6 +268,58 @@ def test_a_driver_without_topics() -> None:
 def test_wrong_names_of_pads(names: str) -> None:
     with pytest.raises(ConfigurationError, match="write NUMBER=NAME"):
         Dex3Options(names=(names,))
+
+
+class Described:
+    """Both hands with these options: names of pads, by hand, and places."""
+
+    def __init__(self, **options: Any) -> None:
+        driver = Dex3Driver(Dex3Options(hands="both", **options))
+        patches = asyncio.run(driver.join(cast("Link", None), ()))
+        self.names = [[module.name for module in patch.modules] for patch in patches]
+        assert driver.geometry is not None
+        self.geometry = driver.geometry
+
+    def at(self, hand: int, pad: int, type_name: str = "pressure") -> np.ndarray[Any, np.dtype[np.float64]]:
+        """(12, 2) m, right and up, as a person sees the palm."""
+        uids = np.arange(hand << 8 | pad << 4, hand << 8 | pad << 4 | 12, dtype=np.uint64)
+        return self.geometry.at([type_name] * 12, uids).position_m[:, :2]
+
+
+def test_pads_lie_where_owners_found_them() -> None:
+    hands = Described()
+    left, right = ({name: pad for pad, name in enumerate(names)} for names in hands.names)
+    assert (left["palm index"], left["palm middle"]) == (right["palm middle"], right["palm index"]) == (6, 8)
+    at = {name: hands.at(1, pad).mean(axis=0) for name, pad in right.items()}
+    assert at["index tip"][0] > 0 > at["middle tip"][0]
+    assert at["palm index"][0] > at["palm centre"][0] > at["palm middle"][0]
+    heights = [at[name][1] for name in ("index tip", "index pad", "palm index", "thumb pad", "thumb tip")]
+    assert heights == sorted(heights, reverse=True)  # the thumb is folded down
+    for name, pad in left.items():
+        assert np.allclose(hands.at(0, pad).mean(axis=0), at[name] * [-1, 1])
+        assert np.array_equal(hands.at(0, pad), hands.at(0, pad, "temperature"))
+
+
+def test_taxels_lie_as_in_an_owners_table() -> None:
+    def corners(pad: int) -> list[list[float]]:
+        places = Described().at(1, pad)
+        signs: list[list[float]] = np.sign((places - places.mean(axis=0))[[0, 2, 9, 11]]).tolist()
+        return signs
+
+    assert corners(4) == [[1, -1], [-1, -1], [1, 1], [-1, 1]]
+    assert corners(0) == [[-1, 1], [1, 1], [-1, -1], [1, -1]]
+    assert corners(6) == [[1, 1], [1, -1], [-1, 1], [-1, -1]]
+    tip = Described().at(1, 5)
+    assert tip[3, 1] > tip[6, 1] == tip[8, 1]
+    assert tip[6, 0] < tip[8, 0]
+
+
+def test_a_name_moves_a_pad() -> None:
+    usual, other = Described(), Described(names=("0=middle tip", "4=nail"), pads=10)
+    assert np.array_equal(other.at(1, 0), usual.at(1, 3))
+    assert other.names[1][:6] == ["middle tip", "thumb tip", "middle pad", "pad 3", "nail", "index tip"]
+    assert other.names[1][9] == "pad 9"
+    assert all(np.isnan(other.at(1, pad)).all() for pad in (3, 4, 9))
 
 
 @pytest.mark.thorough

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from skinware import Structure
 from skinware.geometry import Geometry
-from skinware.nominal_hand import FINGERS, frame_of
+from skinware.nominal_hand import FINGERS, NominalHand
 from skinware.sensor_types import (
     FORCE,
     FORCE_Z,
@@ -187,9 +187,9 @@ def test_hands_of_two_models_lie_beside_each_other() -> None:
 def test_a_second_driver_of_a_frame_with_a_pose_is_turned_alike_and_beside() -> None:
     pose = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], float)
     hands = {name: (hand, quantities_of(hand)) for name in ("left", "right") for hand in [a_hand()]}
-    scene = Scene(hands, {frame_of("right"): pose})
+    scene = Scene(hands, {NominalHand().frame: pose})
     left, right = (scene.of(name, "pressure").position for name in ("left", "right"))
-    assert np.array_equal(scene.pose("left", frame_of("right")), pose)
+    assert np.array_equal(scene.pose("left", NominalHand().frame), pose)
     assert right[:, 0].min() > left[:, 0].max()
     assert np.allclose((right - left)[:, 1:], 0)
 

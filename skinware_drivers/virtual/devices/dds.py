@@ -47,7 +47,7 @@ class EmulatedDex3(SerialEmulator[EmulatedDex3Options]):
     numbered_by = "hands"
 
     def places(self) -> Places:
-        cells = on_pads(*[(12, 4)] * _PADS).reshape(_PADS, 12, 3)
+        cells = on_pads(*[(12, 3)] * _PADS).reshape(_PADS, 12, 3)
         return np.concatenate([cells, cells], axis=1).reshape(-1, 3)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002

@@ -9,7 +9,7 @@ import msgspec
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, on_a_grid
 
 
-class EmulatedPadOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedPadOptions(EmulatorOptions, frozen=True):
     firmware: Annotated[int, msgspec.Meta(description="the firmware version it answers with", ge=0, le=255)] = 3
 
 

@@ -194,7 +194,7 @@ DATA = "data"
 """The timer of a device's bursts."""
 
 
-class EmulatorOptions(Options, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatorOptions(Options, frozen=True):
     """Touch and faults; an emulator adds options for its devices.
 
     Raises:

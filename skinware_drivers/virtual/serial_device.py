@@ -17,7 +17,7 @@ _LONGEST_PAUSE_NS = 200_000_000
 """Longest pause within a command. An older beginning is forgotten: its host has gone, or meant another device."""
 
 
-class SerialEmulatorOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SerialEmulatorOptions(EmulatorOptions, frozen=True):
     """The period of a device; an emulator adds options for the device itself."""
 
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two bursts until the host changes it, ms")] = 10

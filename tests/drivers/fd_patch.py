@@ -60,7 +60,7 @@ class FdPatchDriver(CanAdapter[NoOptions]):
             await link.send(EXTENDED_FLAG | 0x18A4_0000 | node << 8, bytes((what, *range(2, 13))))
 
 
-class EmulatedFdOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedFdOptions(EmulatorOptions, frozen=True):
     """None of its own."""
 
 

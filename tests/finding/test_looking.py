@@ -179,7 +179,7 @@ class Hangs(Answers):
         return "late"
 
 
-class ModelOptions(RoboskinOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ModelOptions(RoboskinOptions, frozen=True):
     model: str
 
 

@@ -28,7 +28,7 @@ class MoreOptions(Options, frozen=True, forbid_unknown_fields=True):
     fast: bool = False
 
 
-class EmulatedOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedOptions(EmulatorOptions, frozen=True):
     period_ms: int = 40
 
 

@@ -24,7 +24,7 @@ def message(content: bytes) -> bytes:
     return b"~" + bytes(stuffed) + b"~"
 
 
-class EmulatedAbilityHandOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedAbilityHandOptions(SerialEmulatorOptions, frozen=True):
     address: Annotated[int, Meta(ge=0, le=255, description="address of the hand")] = 0x50
 
 

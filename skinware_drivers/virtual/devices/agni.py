@@ -24,7 +24,7 @@ def message(number: int, body: bytes) -> bytes:
     return sent + bytes([functools.reduce(operator.xor, sent)])
 
 
-class EmulatedAgniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedAgniOptions(SerialEmulatorOptions, frozen=True):
     sensors: Annotated[tuple[int, ...], Meta(description="number of values of each sensor")] = (16, 4)
 
 

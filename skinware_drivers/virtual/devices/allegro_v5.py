@@ -26,7 +26,7 @@ _JOINTS = 16
 _PADS = (1, 1), (3, 1), (4, 1), (4, 1), (4, 1)
 
 
-class EmulatedAllegroV5Options(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedAllegroV5Options(EmulatorOptions, frozen=True):
     period_ms: Annotated[int, Meta(ge=1, description="time between two messages of a kind, ms")] = 10
 
 
@@ -48,7 +48,7 @@ class EmulatedAllegroV5(Emulator[EmulatedAllegroV5Options]):
         return [(0x054 << 2, bytes(values[:8])), (0x055 << 2, bytes(values[8:]))]
 
 
-class EmulatedAllegroV5TipsOptions(EmulatedAllegroV5Options, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedAllegroV5TipsOptions(EmulatedAllegroV5Options, frozen=True):
     air_pa: Annotated[int, Meta(ge=0, description="pressure of an untouched fingertip, Pa")] = 0
 
 
@@ -69,7 +69,7 @@ class EmulatedAllegroV5Tips(Emulator[EmulatedAllegroV5TipsOptions]):
         return [(0x0F0 << 2, struct.pack("<2i", *pascals[:2])), (0x0F2 << 2, struct.pack("<2i", *pascals[2:]))]
 
 
-class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedAllegroV5UdpOptions(SerialEmulatorOptions, frozen=True):
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two datagrams, ms")] = 3
 
 

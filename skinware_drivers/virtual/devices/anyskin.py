@@ -14,7 +14,7 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
-class EmulatedAnySkinOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedAnySkinOptions(SerialEmulatorOptions, frozen=True):
     mags: Annotated[int, Meta(ge=1, le=64, description="magnetometers of the board")] = 5
 
 

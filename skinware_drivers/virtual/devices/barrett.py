@@ -17,7 +17,7 @@ _TACT = 106
 _TOP_10, _FULL = 1, 2
 
 
-class EmulatedBarrettOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedBarrettOptions(EmulatorOptions, frozen=True):
     nodes: Annotated[tuple[int, ...], Meta(description="nodes of the pucks")] = (11, 12, 13, 14)
 
 

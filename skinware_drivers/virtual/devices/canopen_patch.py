@@ -28,7 +28,7 @@ _TOO_HOT = 0x4210
 _REAL32 = 8
 
 
-class EmulatedCanopenOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedCanopenOptions(EmulatorOptions, frozen=True):
     nodes: Annotated[tuple[int, ...], Meta(description="node ids of the patches, 1-127")] = (5, 6)
     eds: Annotated[str, Meta(description="EDS file; default: the example's")] = ""
     faulty: Annotated[tuple[int, ...], Meta(description="nodes that report an error for a while (EMCY 4210)")] = ()

@@ -22,7 +22,7 @@ _ALL, _FORCES = 0xE20, 0xE00
 _DEFAULT_HZ = 1000
 
 
-class EmulatedDev001Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedDev001Options(SerialEmulatorOptions, frozen=True):
     ports: Annotated[tuple[int, ...], Meta(description="ports with a sensor: 0 to 4")] = (0, 1, 2, 3, 4)
     biased: Annotated[bool, Meta(description="sensors were zeroed; no: they send no number until `bias`")] = True
     period_ms: Annotated[float, Meta(ge=1, description="time between two records until the host changes it, ms")] = 1
@@ -119,7 +119,7 @@ def _each(name: str, sensors: int = 2, pillars: int = 9) -> tuple[int, ...]:
     return (*pillar * pillars, *(whole,) * _WHOLE, *(state,) * pillars, *(slip[1],) * pillars, *slip) * sensors
 
 
-class EmulatedPapillArrayOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedPapillArrayOptions(SerialEmulatorOptions, frozen=True):
     sensors: Annotated[int, Meta(ge=1, le=2, description="sensors that are plugged in")] = 2
     pillars: Annotated[int, Meta(ge=1, le=9, description="pillars of each")] = 9
     period_ms: Annotated[float, Meta(ge=1, description="time between two packets until the host changes it, ms")] = 1

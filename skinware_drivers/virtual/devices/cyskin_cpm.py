@@ -17,7 +17,7 @@ _SENT_AS = [13, 15, 12, 14, 10, 11, 8, 9, 6, 4, 7, 0, 3, 5, 2, 1]
 """Position of taxel 0, 1, 2 ... in the sixteen values of a set."""
 
 
-class EmulatedCyskinCpmOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedCyskinCpmOptions(EmulatorOptions, frozen=True):
     period_ms: Annotated[int, Meta(ge=1, description="time between two sets, ms")] = 20
 
 

@@ -32,7 +32,7 @@ _IMU = struct.pack("<13fh2x", 1, *(0,) * 8, 9.81, *(0,) * 3, 40)
 _POWER = struct.pack("<4f4I", 24, 1, 12, 5, 0, 0, 0, 0)
 
 
-class EmulatedDex3Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedDex3Options(SerialEmulatorOptions, frozen=True):
     hands: Annotated[tuple[int, ...], Meta(description="hands: 0 left, 1 right")] = (0, 1)
     period_ms: Annotated[float, Meta(ge=1, description="time between two samples of a hand, ms")] = 2
 
@@ -67,7 +67,7 @@ _NUMBERS = {"points": 0, "image": 1, "array": 2, "sensors": 26}
 _FRAME = b"palm\0"
 
 
-class EmulatedRos2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedRos2Options(SerialEmulatorOptions, frozen=True):
     topics: Annotated[tuple[int, ...], Meta(description="numbers of the driver's topics that are published")] = (0,)
     message: Annotated[
         Literal["array", "image", "points", "sensors"],

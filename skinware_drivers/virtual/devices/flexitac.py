@@ -16,7 +16,7 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
-class EmulatedFlexiTacOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedFlexiTacOptions(SerialEmulatorOptions, frozen=True):
     rows: Annotated[int, Meta(ge=1, le=64, description="rows of the pad")] = 12
     columns: Annotated[int, Meta(ge=1, le=64, description="columns of the pad")] = 32
     firmware: Annotated[Literal["binary", "text"], Meta(description="firmware of the pad")] = "binary"

@@ -25,7 +25,7 @@ def datagram(skin: int, records: Sequence[tuple[int, bytes]], number: int, time_
     return struct.pack("<IHHQQ", 0x12345678, len(signal), 2, time_us, number) + signal + struct.pack("<I", 0x87654321)
 
 
-class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedIcubEthOptions(SerialEmulatorOptions, frozen=True):
     boards: Annotated[tuple[int, ...], Meta(description="addresses of the skin boards")] = (1,)
     triangles: Annotated[int, Meta(ge=1, le=12, description="triangles of each board")] = 12
     skin: Annotated[int, Meta(ge=0, le=1, description="CAN port of the Ethernet board that they are on")] = 0

@@ -22,7 +22,7 @@ _SERIAL = "LHL10-010-014-{}-B-1-A"
 _FELT, _WANTED = "felt", "wanted"  # in the memory of a device
 
 
-class EmulatedLinkerHandOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedLinkerHandOptions(EmulatorOptions, frozen=True):
     hands: Annotated[tuple[int, ...], Meta(description="identifiers of the hands")] = (0x27,)
     touch: Annotated[
         Literal["12x6", "10x4", "fingers", "fingers_90", "hand_23x9", "hand_12x6"],

@@ -60,7 +60,7 @@ def unstuff(stuffed: bytes) -> bytes:
     return data
 
 
-class EmulatedOpenPatchOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedOpenPatchOptions(SerialEmulatorOptions, frozen=True):
     modules: Annotated[int, Meta(ge=1, le=64, description="modules of twelve pressure sensors")] = 4
     period_ms: Annotated[float, Meta(ge=1, le=1000, description="time between two samples, ms")] = 10
     serial_number: Annotated[str, Meta(max_length=16, description="name of the patch")] = "1"

@@ -29,7 +29,7 @@ def message(*parts: bytes) -> bytes:
     return sent + bytes([-sum(sent) & 0xFF])
 
 
-class EmulatedPaxiniOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedPaxiniOptions(SerialEmulatorOptions, frozen=True):
     board: Annotated[
         Literal["converter", "high_speed"], Meta(description="sensors that are asked, or a hand that streams")
     ] = "converter"

@@ -38,7 +38,7 @@ _AT_REST = tuple(4 * (not place) for rows, columns in _SHAPES for place in range
 """One taxel of each matrix is not at 0."""
 
 
-class EmulatedInspireOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedInspireOptions(SerialEmulatorOptions, frozen=True):
     unit: Annotated[int, Meta(ge=0, le=255, description="number of the hand")] = 1
     zero: Annotated[tuple[int, ...], Meta(description="matrices that send only 0: 1 to 17, the last is the palm")] = ()
     swapped: Annotated[bool, Meta(description="send the low byte of a register first")] = False
@@ -71,7 +71,7 @@ class EmulatedInspire(ModbusEmulator[EmulatedInspireOptions]):
         return _sent({3000 + 2 * number: value for number, value in enumerate(sent)}, self.options.swapped)
 
 
-class EmulatedDfrobotOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedDfrobotOptions(SerialEmulatorOptions, frozen=True):
     units: Annotated[tuple[int, ...], Meta(description="numbers of the arrays")] = (1,)
     shapes: Annotated[tuple[Literal["4x8", "6x6"], ...], Meta(description="rows and columns of each, or of all")] = (
         "6x6",
@@ -137,13 +137,12 @@ _OTHER_COMMANDS = {
 _N_VALUES = {"touch": 20, "pressure": 97, "array_pressure": 25, "force3d": 4 * 93 + 12}
 
 
-class EmulatedRevo2Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedRevo2Options(SerialEmulatorOptions, frozen=True):
     unit: Annotated[int, Meta(ge=1, le=254, description="number of the hand")] = 127
     side: Annotated[Literal["right", "left"], Meta(description="side that the hand reports")] = "right"
     edition: Annotated[
         Literal["touch", "pressure", "force3d", "array_pressure"], Meta(description="which sensors it has")
     ] = "touch"
-    says_edition: Annotated[bool, Meta(description="it reports its edition, in register 970")] = True
     kind: Annotated[Literal[0, 1, 2], Meta(description="values of the pressure edition: raw, calibrated, force")] = 0
     enabled: Annotated[bool, Meta(description="touch is on as soon as the hand has power")] = True
     touch: Annotated[bool, Meta(description="it has touch; hands without take commands and have no data")] = True
@@ -209,8 +208,7 @@ class EmulatedRevo2(ModbusEmulator[EmulatedRevo2Options]):
         options = self.options
         on = int(options.touch and device.memory.get("on", options.enabled))
         found = {901: 2 if options.side == "left" else 1, **dict.fromkeys(_SWITCHES[options.edition], on)}
-        if options.says_edition:
-            found[970] = _EDITIONS[options.edition] if options.touch else 0
+        found[970] = _EDITIONS[options.edition] if options.touch else 0
         if options.edition == "pressure":
             found[6000] = device.memory.get("kind", options.kind)
         return found
@@ -255,7 +253,7 @@ _SERIAL_NUMBER = "BCUTR40000000001"
 _KIND = "4023"  # in the memory of a device: content of that register
 
 
-class EmulatedRevo3Options(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedRevo3Options(SerialEmulatorOptions, frozen=True):
     unit: Annotated[int, Meta(ge=1, le=254, description="number of the hand")] = 1
     side: Annotated[Literal["right", "left"], Meta(description="side that the hand reports")] = "right"
     mapping: Annotated[Literal["pressure", "matrix", "packed"], Meta(description="which registers it has")] = "pressure"

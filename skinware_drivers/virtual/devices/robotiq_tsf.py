@@ -25,7 +25,7 @@ _FIELDS = {
 _VERSION = bytes.fromhex("010203")
 
 
-class EmulatedRobotiqTsfOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedRobotiqTsfOptions(SerialEmulatorOptions, frozen=True):
     fingers: Annotated[tuple[int, ...], Meta(description="fingertips: 0, 1")] = (0, 1)
     slow: Annotated[int, Meta(ge=1, description="only every so many packets have magnetometer and temperature")] = 1
     timed: Annotated[bool, Meta(description="send the device's time in microseconds")] = True

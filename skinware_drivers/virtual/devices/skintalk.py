@@ -15,7 +15,7 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
-class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedSkintalkOptions(SerialEmulatorOptions, frozen=True):
     patches: Annotated[tuple[int, ...], Meta(description="numbers of the patches")] = (1, 2, 3, 4, 5, 6, 7, 8)
     cells: Annotated[int, Meta(ge=1, le=16, description="cells of each patch")] = 16
     firmware: Annotated[Literal["octocan", "octocan3"], Meta(description="whose commands are obeyed")] = "octocan"

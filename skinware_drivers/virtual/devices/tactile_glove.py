@@ -13,7 +13,7 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, on_a_grid
 
 
-class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedTactileGloveOptions(SerialEmulatorOptions, frozen=True):
     taxels: Annotated[int, Meta(ge=1, le=64, description="taxels of the glove")] = 64
     period_ms: Annotated[float, Meta(ge=0.1, description="time between two packets of a taxel, ms")] = 30
 

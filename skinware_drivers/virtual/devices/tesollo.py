@@ -31,7 +31,7 @@ _TIPS = {
 _MODEL = {"1f": 0x1F02, "2f": 0x2F03, "3f": 0x3F02, "4f": 0x4F02, "5f": 0x5F22, "5f15": 0x5F44}
 
 
-class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedTesolloOptions(SerialEmulatorOptions, frozen=True):
     hand: Annotated[Literal["1f", "2f", "3f", "4f", "5f", "5f15"], Meta(description="model")] = "5f"
     tips: Annotated[Literal["tactile_m", "tactile_s", "six_axes", "four_axes"], Meta(description="kind of sensors")] = (
         "tactile_m"

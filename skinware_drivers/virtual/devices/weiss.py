@@ -62,7 +62,7 @@ def message(command: int, payload: bytes) -> bytes:
     return head + struct.pack("<H", crc(head))
 
 
-class EmulatedWeissWtsOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedWeissWtsOptions(SerialEmulatorOptions, frozen=True):
     columns: Annotated[int, Meta(ge=1, le=32, description="cells in a row")] = 4
     rows: Annotated[int, Meta(ge=1, le=32, description="rows of cells")] = 8
 
@@ -134,7 +134,7 @@ def dsa_message(command: int, payload: bytes) -> bytes:
     return BEGIN + body + (struct.pack("<H", crc(body)) if payload else b"")
 
 
-class EmulatedWeissDsaOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedWeissDsaOptions(SerialEmulatorOptions, frozen=True):
     fingers: Annotated[int, Meta(ge=1, le=3, description="fingers, of two matrices each")] = 3
     period_ms: Annotated[float, Meta(ge=10, le=1000, description="time between two frames, ms")] = 100
 

@@ -24,7 +24,7 @@ def message(sync: int, body: bytes) -> bytes:
     return bytes((0xAA, sync)) + covered + struct.pack("<H", binascii.crc_hqx(covered, 0xFFFF))
 
 
-class EmulatedWujiGloveOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedWujiGloveOptions(SerialEmulatorOptions, frozen=True):
     hand: Literal["left", "right"] = "left"
     period_ms: Annotated[
         float, Meta(ge=1, le=1000, description="time between two frames until the host changes it, ms")

@@ -22,7 +22,7 @@ from skinware_drivers.virtual import (
 )
 
 
-class EmulatedXelaOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedXelaOptions(EmulatorOptions, frozen=True):
     boards: Annotated[tuple[int, ...], Meta(description="numbers of the boards")] = (1,)
     model: Annotated[
         Literal["4x4", "4x6"],
@@ -73,7 +73,7 @@ class EmulatedXela(Emulator[EmulatedXelaOptions]):
 _TAXELS = {"uSPa44": (16, 4), "uSPa46": (24, 6), "uSPa22": (4, 2), "uSCuAH": (30, 6)}
 
 
-class EmulatedXelaServerOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedXelaServerOptions(SerialEmulatorOptions, frozen=True):
     sensors: Annotated[tuple[int, ...], Meta(description="numbers of the sensors")] = (1,)
     model: Annotated[Literal["uSPa44", "uSPa46", "uSPa22", "uSCuAH"], Meta(description="of all sensors")] = "uSPa44"
     calibrated: Annotated[bool, Meta(description="send forces, besides the counts")] = True

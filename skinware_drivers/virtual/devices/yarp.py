@@ -18,7 +18,7 @@ _BOOT_TIME_S = 1_700_000_000.0
 _TAGS = {3: 256 + 10, 4: 256 + 20}
 
 
-class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedYarpOptions(SerialEmulatorOptions, frozen=True):
     length: Annotated[int, Meta(ge=1, le=3072, description="values of a message")] = 192
     yarp: Annotated[
         Literal[3, 4], Meta(description="major version of its YARP, which decides how a list of doubles is marked")

@@ -29,7 +29,7 @@ _PLACES = ("BOARD", "BOARD/TRIANGLE", "BOARD/TRIANGLE/TAXEL")
 _LIMITS = (("board", 1, 14), ("triangle", 0, 15), ("taxel", 0, 11))
 
 
-class EmulatedRoboskinOptions(EmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedRoboskinOptions(EmulatorOptions, frozen=True):
     """The boards, their touch and their faults."""
 
     boards: Annotated[tuple[int, ...], Meta(description="CAN addresses of the boards, 1-14")] = (7, 8, 9, 10)

@@ -15,7 +15,7 @@ from msgspec import Meta
 from skinware_drivers.virtual import Device, SerialEmulator, SerialEmulatorOptions, cut_packets, on_a_grid
 
 
-class EmulatedOptoforceOptions(SerialEmulatorOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class EmulatedOptoforceOptions(SerialEmulatorOptions, frozen=True):
     """Which model it is, and what is wrong with it."""
 
     sensors: Annotated[Literal[1, 4], Meta(description="how many sensors it has")] = 1

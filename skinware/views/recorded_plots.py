@@ -78,8 +78,9 @@ class RecordedPlots:
 
     def close(self) -> None:
         self._is_over = True
-        self._reading.submit(self._close_files)
-        self._reading.shutdown(wait=False)
+        self._reading.shutdown()
+        for recording in self._recordings.values():
+            recording.close()
 
     def _missing(self) -> Iterator[_Part]:
         parts: dict[tuple[str, str, str, Stretch], _Part] = {}
@@ -130,10 +131,6 @@ class RecordedPlots:
                     rows.add(sample.position, round(time_s * NS_PER_S), found)
             if self._is_over:
                 return
-
-    def _close_files(self) -> None:
-        for recording in self._recordings.values():
-            recording.close()
 
 
 def _source_of(driver: ShownDriver, line: Line) -> tuple[str, str] | None:

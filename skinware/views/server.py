@@ -196,9 +196,10 @@ class ViewServer:
                 await self._serve(viewer, connection)
         finally:
             del self._viewers[viewer]
-            viewer.plots.close()
-            if show is not self._live:
-                await asyncio.shield(asyncio.to_thread(show.close))
+            if show is self._live:
+                viewer.plots.close()
+            else:
+                await asyncio.shield(asyncio.to_thread(_close, viewer))
 
     async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
         """Carry out the operations of a viewer; it gets a turn for each one that it asks for."""
@@ -265,3 +266,9 @@ class ViewServer:
 def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:
     own = {"Content-Type": f"{content_type}; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
     return Response(status.value, status.phrase, Headers(own | _HEADERS), body)
+
+
+def _close(viewer: Viewer) -> None:
+    """Close the files of a viewer of recordings, which may wait for what is being read."""
+    viewer.plots.close()
+    viewer.show.close()

@@ -161,7 +161,7 @@ def test_dates_in_a_time_zone(tmp_path: Path, text: str, begin: str) -> None:
 def test_times_as_such(tmp_path: Path, kind: str, end: str) -> None:
     """Also durations, and dates so near to 1970 that their size says nothing."""
     values, path = counts(N, 1), tmp_path / f"data.{end}"
-    columns = {"since": np.rint(TIMES * 1e6).astype("i8").view(kind), "taxel_0": values[:, 0]}
+    columns: dict[str, Any] = {"since": np.rint(TIMES * 1e6).astype("i8").view(kind), "taxel_0": values[:, 0]}
     np.savez(path, **columns) if end == "npz" else pa.parquet.write_table(pa.table(columns), path)
     require(only(path), values)
 

@@ -232,7 +232,7 @@ def self_touch_places(seed: int, presses: int) -> str:
     session = gathered(world, presses, world.scene.carried)
     off_mm = 1e3 * np.linalg.norm(placed(world, session, RADIUS_M)[1], axis=1)
     text = f"p50 {np.median(off_mm):.2f}, most {off_mm.max():.2f} mm; {len(session.presses)} of {presses} presses found"
-    return f"{text} | half a pitch, 1.5 mm | {judged(off_mm.max() <= 1.5)}"
+    return f"{text} | half a pitch, 1.5 mm | {judged(bool(off_mm.max() <= 1.5))}"
 
 
 def learning(seed: int, steps: int) -> str:

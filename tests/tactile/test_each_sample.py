@@ -7,16 +7,22 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from skinware import DriverReader, DriverWriter, Namespace, Structure
+from skinware.cli._gathering import Gathering
 from skinware.sensor_types import PRESSURE
+from skinware.tactile.calibration.sources import LoadSource, PoseSource
+from skinware.tactile.calibration.state import PressSession
 from skinware.tactile.calm_driver import DriverSource
 from skinware.tactile.calm_service import CalmService
 from skinware.tactile.contacts_service import ContactsReader
 from skinware.tactile.onsets import EventKind
+from skinware.views.live import frames_until
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import running
 from tests.tactile.skins import placed, triangles
@@ -201,6 +207,41 @@ def test_an_onset_in_a_hold_up_is_that_of_the_second_touched_sample(calm_namespa
             event = next(contacts.events(timeout_s=30))
             assert (event.kind, event.acquired_ns) == (EventKind.ONSET, (before + 22) * PERIOD_NS)
         assert service.status()["missed"] == 0
+
+
+def test_a_tool_gets_the_newest_sample_and_then_each() -> None:
+    hand = Hand()
+    with hand.writer, DriverReader("hand") as reader:
+        hand.publish(3)
+        samples = frames_until(reader, lambda: False)
+        assert next(samples).sequence == 3
+        hand.publish(3)
+        assert [next(samples).sequence for _ in range(3)] == [4, 5, 6]
+        hand.publish(2)
+        assert next(frames_until(reader, lambda: False)).sequence == 8
+
+
+def test_a_pose_belongs_to_the_newest_sample(tmp_path: Path) -> None:
+    hand, paired = Hand(), []
+    publications = iter([1, 1, 3, 0, 0])
+
+    class Noting(PressSession):
+        def take(self, time_ns: int, load: npt.NDArray[Any], pose: npt.NDArray[np.float64] | None) -> None:
+            paired.append(time_ns // PERIOD_NS)
+
+        def is_complete(self, share: float) -> bool:
+            count = next(publications, None)
+            hand.publish(count or 0)
+            return count is None
+
+    class Poses:
+        def newest(self) -> npt.NDArray[np.float64]:
+            return np.zeros(3)
+
+    with hand.writer, DriverReader("hand") as reader:
+        source, poses = LoadSource(reader.structure, "calm"), cast("PoseSource", Poses())
+        Gathering(reader, Noting(N), source, poses, tmp_path / "state", as_json=True).run("", 1.0, None)
+    assert paired == [1, 2, 5]
 
 
 @pytest.mark.thorough

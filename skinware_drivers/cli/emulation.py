@@ -254,19 +254,17 @@ class PressingService:
         """Publish and answer what is due, and return the next time of publishing, CLOCK_MONOTONIC ns."""
         waiting = self._writer.answer_requests()
         if waiting or now_ns >= self._due_ns:
-            self._publish(time.monotonic_ns())  # later than the requests
+            time_ns = time.monotonic_ns()  # later than the requests
+            found = self._hardware.pressing(time_ns)[:_MOST]
+            columns = self._writer.begin(from_last=True)
+            columns["count"][0] = len(found)
+            for row, (point_m, force_n) in enumerate(found):
+                columns["point_m"][row], columns["force_n"][row] = point_m, force_n
+            self._writer.commit(time_ns)
             self._due_ns = now_ns + NS_PER_S // _RATE_HZ
         for request in waiting:
             request.reply(position=self._writer.position)
         return self._due_ns
-
-    def _publish(self, now_ns: int) -> None:
-        found = self._hardware.pressing(now_ns)[:_MOST]
-        columns = self._writer.begin(from_last=True)
-        columns["count"][0] = len(found)
-        for row, (point_m, force_n) in enumerate(found):
-            columns["point_m"][row], columns["force_n"][row] = point_m, force_n
-        self._writer.commit(now_ns)
 
     def press(
         self, at_m: object, force_n: object = 3.0, radius_m: object = 0.006, seconds: object = 1.0

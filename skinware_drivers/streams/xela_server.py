@@ -73,23 +73,19 @@ class _SeenMessages(Framer):
         done = 0
         for line in lines:
             done += len(line) + 1
-            self._count(line, self._take_apart(line, self._before + done, found))
+            is_good = self._take_apart(line, self._before + done, found)
+            if is_good:
+                self.counters.frame_bytes += len(line) + 1
+            elif is_good is None:
+                self.counters.idle_bytes += len(line) + 1
+            else:
+                self.counters.refused += 1
+                self.counters.skipped_bytes += len(line) + 1
         if len(rest) > _LONGEST:  # no message, and nothing to hold back
             self.counters.refused += 1
             self.counters.skipped_bytes += len(rest)
             done = len(stream)
         return found, done
-
-    def _count(self, line: bytes, is_good: bool | None) -> None:
-        """Count a line: as a message with values (True), without (None), or as no message (False)."""
-        counters = self.counters
-        if is_good:
-            counters.frame_bytes += len(line) + 1
-        elif is_good is None:
-            counters.idle_bytes += len(line) + 1
-        else:
-            counters.refused += 1
-            counters.skipped_bytes += len(line) + 1
 
     def _take_apart(self, line: bytes, end: int, found: list[Framed]) -> bool | None:
         """Append the frames of a message to ``found``; return None for one without sensors, False for a bad one."""

@@ -119,28 +119,21 @@ class _Vectors(Framer):
         self.counters.skipped_bytes += size
 
     def _take(self, message: bytes, end: int, found: list[Framed]) -> None:
-        """Count a whole message as used or refused, and append its frames to ``found``."""
+        """Count a whole message as used or refused, append its frames to ``found``, now and then with its length."""
         envelope, values = _content(message[_FIXED + 4 * (message[len(BEGIN)] + 1) :])
-        if values is None or not self._fits(values, end, found):
+        if values is not None:
+            self._times = self._times + 1 if len(values) == self._last else 1
+            self._last = len(values)
+            if self._times % _REPORT_EVERY == (0 if len(values) == self._length else _SURE):
+                found.append(Framed(LENGTH << 8, len(values).to_bytes(4, "little"), end))
+        if values is None or self._length not in (0, len(values)):
             self.counters.refused += 1
             self._skip(len(message))
             return
         self.counters.frame_bytes += len(message)
-        self._cut_up(values, envelope, end, found)
-
-    def _fits(self, values: npt.NDArray[np.float32], end: int, found: list[Framed]) -> bool:
-        """Return whether a message has the expected number of values; report the number now and then."""
-        self._times = self._times + 1 if len(values) == self._last else 1
-        self._last = len(values)
-        if self._times % _REPORT_EVERY == (0 if len(values) == self._length else _SURE):
-            found.append(Framed(LENGTH << 8, len(values).to_bytes(4, "little"), end))
-        return self._length in (0, len(values))
-
-    def _cut_up(self, values: npt.NDArray[np.float32], envelope: bytes, end: int, found: list[Framed]) -> None:
-        if not self._parts:
-            return
-        time_ms = _time_ms(envelope)
-        kind, stamp = (PLAIN, bytes(4)) if time_ms is None else (TIMED, time_ms.to_bytes(4, "little"))
+        match = _ENVELOPE.fullmatch(envelope)
+        time_ms = int(float(match["time"]) * 1e3) & _U32 if match is not None else 0
+        kind, stamp = TIMED if time_ms else PLAIN, time_ms.to_bytes(4, "little")
         filled = values.tobytes().ljust(-(-len(values) // VALUES_OF_A_FRAME) * 4 * VALUES_OF_A_FRAME, b"\0")
         for number, first in self._parts:
             body = stamp + filled[4 * first : 4 * (first + VALUES_OF_A_FRAME)]
@@ -197,11 +190,3 @@ def _mixed(numbers: bytes, count: int) -> npt.NDArray[np.float32] | None:
             with np.errstate(over="ignore"):
                 return np.array(found, np.float64).astype("<f4")
     return None
-
-
-def _time_ms(envelope: bytes) -> int | None:
-    """Return the time of a message in ms, modulo 2 ** 32; None if it has no time, or 0."""
-    match = _ENVELOPE.fullmatch(envelope)
-    if match is None:
-        return None
-    return int(float(match["time"]) * 1e3) & _U32 or None

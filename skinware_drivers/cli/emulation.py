@@ -21,15 +21,20 @@ from skinware.memory.schema import Column
 from skinware.realtime import NS_PER_S
 from skinware.service import ServiceWriter
 from skinware_drivers.bus import Bus, FrameBatch
-from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware, Pressing, WireFrame, put_away
+from skinware_drivers.virtual.hardware import (
+    EmulatedHardware,
+    PlacedHardware,
+    Pressing,
+    WireFrame,
+    due_frames,
+    put_away,
+)
 
 _STATUS_NS = 1_000_000_000
 _RETRY_NS = 2_000_000
 """Pause before a frame that a full queue refused is sent again."""
 _GIVE_UP_NS = 500_000_000
 """Age at which a refused frame is dropped: newer ones are worth more."""
-_LONGEST_BACKLOG_NS = 1_000_000_000
-"""Age at which frames that were not sent, because the process was stopped, count as unheard."""
 _FIRST_BACKOFF_NS, _LONGEST_BACKOFF_NS = 100_000_000, 2_000_000_000
 """Pauses between attempts to open a bus that went down."""
 
@@ -189,10 +194,7 @@ class Emulation:
             return now_ns + self._backoff_ns
 
     def _send(self, now_ns: int) -> int | None:
-        due_ns = self._hardware.next_due_ns()
-        if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
-            self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
-        self._outbox += self._hardware.emit(now_ns)
+        self._outbox += due_frames(self._hardware, now_ns)[0]
         if self._outbox:
             self._latest_ns = max(self._latest_ns, self._clock() - self._outbox[0].time_ns)
         while self._outbox:

@@ -28,6 +28,7 @@ from skinware_drivers.virtual.hardware import (
     PlacedHardware,
     Pressing,
     WireFrame,
+    due_frames,
     emulators_instead,
     load_emulator,
     medium_of,
@@ -38,8 +39,6 @@ from skinware_drivers.virtual.stage import Stage
 DEFAULT_EMULATOR = "roboskin"
 
 _AT_ONCE = 0
-_LONGEST_BACKLOG_NS = 1_000_000_000
-"""Frames and bytes that wait longer are dropped, as from a full receive buffer."""
 
 
 class EmulatedBus(Bus):
@@ -106,7 +105,6 @@ class VirtualCanBus(EmulatedBus):
         self.bit_rate: int = self._wire.bit_rate if self._wire else 0
         self._timer: Timer | None = None
         self._pending: list[WireFrame] = []
-        self._due_ns: int | None = None
         self._next_error: BusError | None = None
 
     # Bus
@@ -147,9 +145,9 @@ class VirtualCanBus(EmulatedBus):
             raise BusNotAvailable(f"{self.name} is not open")
         now_ns = self._clock()
         if len(self._pending) < batch.free:
-            if self._due_ns is not None and self._due_ns < now_ns - _LONGEST_BACKLOG_NS:
-                self.counters.dropped += self.hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
-            for frame in self.hardware.emit(now_ns):
+            frames, too_old = due_frames(self.hardware, now_ns)
+            self.counters.dropped += too_old
+            for frame in frames:
                 if len(frame.payload) <= self.payload_size:
                     self._pending.append(frame)
                 else:
@@ -220,8 +218,7 @@ class VirtualCanBus(EmulatedBus):
         if self._pending:
             self._wake_at(_AT_ONCE)
             return
-        self._due_ns = due_ns = self.hardware.next_due_ns()
-        self._wake_at(due_ns)
+        self._wake_at(self.hardware.next_due_ns())
 
     def _wake_at(self, time_ns: int | None) -> None:
         if self._timer is not None:
@@ -302,11 +299,7 @@ class EmulatedPort(Port):
     def read(self, size: int) -> bytes:
         if self._is_away:
             raise BusNotAvailable("the emulated line went away, perhaps unplugged")
-        now_ns = self._clock()
-        due_ns = self._hardware.next_due_ns()
-        if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
-            self._hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
-        self._unread += self._hardware.emit(now_ns)
+        self._unread += due_frames(self._hardware, self._clock())[0]
         if getattr(self._hardware, "datagrams", False):
             data = self._unread.popleft().payload if self._unread else b""
         else:

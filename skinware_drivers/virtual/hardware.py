@@ -107,6 +107,7 @@ EMULATORS = "skinware.emulators"
 """The entry point group of emulators; each registers under the name of its driver."""
 
 
+_LONGEST_BACKLOG_NS = 1_000_000_000
 _FARTHEST_M, _STRONGEST_N, _WIDEST_M, _SHORTEST_S, _LONGEST_S = 100.0, 100.0, 0.1, 0.05, 3600.0
 
 
@@ -243,6 +244,14 @@ def emulators_instead(medium: str) -> str:
             if medium_of(load_emulator(name)) == medium:
                 fitting.append(f"virtual:{name}")
     return f"; emulators that fit: {', '.join(fitting)}" if fitting else ""
+
+
+def due_frames(hardware: EmulatedHardware, now_ns: int) -> tuple[list[WireFrame], int]:
+    """Return the frames that are due, and how many are dropped for their age, as from a full receive buffer."""
+    due_ns, too_old = hardware.next_due_ns(), 0
+    if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
+        too_old = hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
+    return hardware.emit(now_ns), too_old
 
 
 def put_away(hardware: EmulatedHardware) -> None:

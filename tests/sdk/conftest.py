@@ -13,7 +13,7 @@ from skinware.realtime import NS_PER_S
 from skinware_drivers.can import roboskin, roboskin_setup
 from skinware_drivers.running import bus_line
 from skinware_drivers.testing.waiting import wait_until
-from skinware_drivers.virtual import bus
+from skinware_drivers.virtual import hardware
 from tests.sdk.cable import SO_TIMESTAMPNS, Cable, pass_ms
 
 HURRIED_WAIT_S = 0.06
@@ -23,7 +23,7 @@ HURRIED_WAIT_S = 0.06
 @pytest.fixture(autouse=True)
 def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     """Emulated boards keep what nobody fetched for a while: a busy machine must not lose frames of these tests."""
-    monkeypatch.setattr(bus, "_LONGEST_BACKLOG_NS", 30 * NS_PER_S)
+    monkeypatch.setattr(hardware, "_LONGEST_BACKLOG_NS", 30 * NS_PER_S)
 
 
 @pytest.fixture

@@ -17,7 +17,6 @@ from skinware.geometry import GeometryGroup, geometry_to_toml, read_geometry
 from skinware_drivers.virtual.devices.xela import EmulatedXela, EmulatedXelaOptions
 from skinware_drivers.virtual.physics.binding import find_binding
 from skinware_drivers.virtual.physics.scene import PhysicsScene
-from skinware_drivers.virtual.physics.taxels import places_in
 from skinware_drivers.virtual.physics.transfer import Transfer, TransferSettings
 from skinware_drivers.virtual.physics.world import PhysicsWorld
 from tests.specification import touching as specified
@@ -41,13 +40,19 @@ def pressed(scene: PhysicsScene, force_n: float = 3.0, x: float = 0.0, y: float 
 
 
 def test_a_geometry_file_becomes_taxels_and_comes_back(tmp_path: Path) -> None:
+    import mujoco
+
     random = np.random.default_rng(3)
     places = [(x, y, 0.0) for x, y in random.uniform(-0.015, 0.015, (7, 2)).tolist()]
     group = GeometryGroup("pressure", "pad", tuple(range(100, 107)), tuple(places), ((0.0, 0.0, 1.0),) * 7)
     (tmp_path / "places.toml").write_text(geometry_to_toml([group]))
     scene = pad(tmp_path, 'geometry = "places.toml"')
     [module] = scene.modules
-    back = places_in(scene.model, 0, int(module.geoms[0]), 7)
+    mesh, geom = scene.model.mesh(f"taxels 0 on {module.geoms[0]}"), scene.model.geom(module.geoms[0])
+    turned = np.empty(9)
+    mujoco.mju_quat2Mat(turned, geom.quat)
+    vertices = scene.model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + 7]
+    back = vertices @ turned.reshape(3, 3).T + geom.pos
     assert np.abs(back - places).max() < 1e-8  # MuJoCo keeps vertices as float32
     (tmp_path / "back.toml").write_text(
         geometry_to_toml([module.group("pressure", np.arange(100, 107, dtype=np.uint64))])

@@ -147,14 +147,6 @@ def place_sensors(model: Any, taxels: list[BoundTaxels]) -> list[list[slice]]:
     return found
 
 
-def places_in(model: Any, module: int, geom: int, count: int) -> ArrayF:
-    """Return (count, 3) the places of taxels in the frame of their body, as a compiled scene has them, m."""
-    mesh = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_MESH, f"taxels {module} on {geom}")
-    first = int(model.mesh_vertadr[mesh])
-    places: ArrayF = model.mesh_vert[first : first + count] @ _rotation(model.geom_quat[geom]).T + model.geom_pos[geom]
-    return places
-
-
 def _rotation(quaternion: ArrayF) -> ArrayF:
     matrix = np.empty(9)
     mujoco.mju_quat2Mat(matrix, quaternion)

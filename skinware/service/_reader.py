@@ -8,7 +8,6 @@ from typing import Any, Self
 
 from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.announcement import ReaderRecord
-from skinware.memory.file_layout import MAX_SLOTS
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import ACQUIRED, Sample, SampleT
@@ -19,6 +18,8 @@ from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
 
 _ENDLESS_NS = 1 << 61
+_MOST_WHILE_LATE = 32
+"""Half of the largest ring: what has waited in it is caught up with in a third of each period."""
 
 
 class ServiceReader(Taking[SampleT]):
@@ -130,7 +131,7 @@ class ServiceReader(Taking[SampleT]):
     def read_next(self, *, timeout_s: float | None = 5.0) -> SampleT:
         """Return the sample after the last one taken, and the newest at first: a program that was held up catches up.
 
-        If 64 more come before it has, it is too slow: it gets the newest ones, until none waits. ``left_out`` counts
+        If 32 more come before it has, it is too slow: it gets the newest ones, until none waits. ``left_out`` counts
         those between, as ``missed`` does.
 
         Raises:
@@ -141,7 +142,7 @@ class ServiceReader(Taking[SampleT]):
             self._came_since = 0
         elif before > 0:
             self._came_since += max(0, waiting - before)
-        is_too_slow = waiting > 1 and self._came_since >= MAX_SLOTS
+        is_too_slow = waiting > 1 and self._came_since >= _MOST_WHILE_LATE
         self._waiting_then = 0 if is_too_slow else max(0, waiting - 1)
         if is_too_slow:
             self.left_out += waiting - 1

@@ -1,4 +1,4 @@
-/* reflex.c: acts on a touch within two samples; reflex [NAMESPACE] prints each onset and the age of its sample. */
+/* reflex.c: acts on a touch within two samples; reflex [NAMESPACE] prints onsets, the age and time of their samples. */
 #define SKINWARE_IMPLEMENTATION
 #include <skinware.h>
 
@@ -32,8 +32,8 @@ static void look(const skinware_frame *frame, const struct contacts *contacts) {
         if (k < n_known)
             continue;
         act(id[i]);
-        printf("%s %u %.0f us\n", provisional[i] ? "onset" : "confirmed", id[i],
-               (double)(skinware_now_ns() - frame->acquired_ns) / 1000.0);
+        printf("%s %u %.0f us %lld ns\n", provisional[i] ? "onset" : "confirmed", id[i],
+               (double)(skinware_now_ns() - frame->acquired_ns) / 1000.0, (long long)frame->acquired_ns);
     }
     n_known = count < 64 ? count : 64;
     memcpy(known, id, n_known * sizeof known[0]);

@@ -87,6 +87,11 @@ class Attachment(Generic[SampleT]):
         return int(self._ring.segment.header["writer_pid"])
 
     @property
+    def slack_ns(self) -> int:
+        """How long it takes the writer to go round its ring at its nominal rate, 0 if it has none."""
+        return self._ring.period_ns * self._ring.slot_count
+
+    @property
     def missed_periods(self) -> int:
         return self._ring.missed_periods
 

@@ -314,11 +314,6 @@ class Tap(ServiceReader[SampleT]):
         """The writer's nominal period, 0 if it has none."""
         return self._ring.period_ns
 
-    @property
-    def slack_ns(self) -> int:
-        """How long it takes the writer to go round its ring at its nominal rate, 0 if it has none."""
-        return self._ring.period_ns * self._ring.slot_count
-
     def ring_in_c(self) -> RingReader[SampleT]:
         if not self._turns_in_c:
             self._leave_to_c()

@@ -26,7 +26,8 @@ from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
 _JUDGE_EVERY_NS = NS_PER_S // 5
-_SERVICES_EVERY_NS = NS_PER_S // 2
+_LOOK_EVERY_NS = NS_PER_S // 2
+"""Between two looks for services of all kinds, one after the other: what came first warms the caches for the others."""
 _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _EARLY_NS = 5_000_000
@@ -56,7 +57,7 @@ class Origin:
     ) -> None:
         self.namespace, self.names, self.calm = namespace, tuple(names), calm
         self.recording, self.is_beside = recording, is_beside
-        self.live = LiveDrivers(namespace, names)
+        self.live = LiveDrivers(namespace, names, every_ns=_LOOK_EVERY_NS)
         self._calm = None if calm is None else LiveDrivers(calm, names)
         namespaces = [namespace, *([] if calm is None else [calm])]
         self._contacts = [LiveSources[ContactsSample](each, ContactsReader) for each in namespaces]
@@ -72,7 +73,7 @@ class Origin:
 
     def look(self) -> list[LiveDriver]:
         if now_ns() >= self._look_ns:
-            self._look_ns = now_ns() + _SERVICES_EVERY_NS
+            self._look_ns = now_ns() + _LOOK_EVERY_NS
             for services in self._services:
                 services.look()
         return self.live.look()
@@ -250,6 +251,12 @@ class Follower:
 
     def get(self, number: int) -> ShownDriver | None:
         return next((driver for driver in self.drivers if driver.number == number), None)
+
+    @property
+    def slack_s(self) -> float:
+        """How long the ring of the fastest driver keeps a snapshot."""
+        slacks_ns = [driver.live.reader.slack_ns for driver in self.drivers]
+        return min([slack_ns for slack_ns in slacks_ns if slack_ns], default=NS_PER_S) / NS_PER_S
 
     def take(self, period_ns: int) -> list[ShownDriver]:
         """Take newer snapshots without waiting.

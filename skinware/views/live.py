@@ -155,9 +155,9 @@ class EverySnapshot:
 class LiveDrivers:
     """The drivers of a namespace, dead ones too as long as their last snapshot can be read."""
 
-    def __init__(self, namespace: Namespace, names: Collection[str] = ()) -> None:
+    def __init__(self, namespace: Namespace, names: Collection[str] = (), *, every_ns: int | None = None) -> None:
         self.namespace = namespace
-        self._drivers = Drivers(namespace, DriverReader, names or None)
+        self._drivers = Drivers(namespace, DriverReader, names or None, every_ns=every_ns)
         self._live: dict[str, LiveDriver] = {}
 
     def get(self, name: str) -> LiveDriver | None:

@@ -279,7 +279,8 @@ class Newest:
         status, raw = self.status[quantity.where], self.frame.values[quantity.where]
         if raw.dtype.kind == "f" or raw.dtype.itemsize > 2:
             return levels_of(self.physical(quantity), status, low, high)
-        levels: Levels = _levels_by_raw(raw.dtype, quantity.type.scale, quantity.type.offset, low, high)[raw]
+        by_raw = _levels_by_raw(raw.dtype, quantity.type.scale, quantity.type.offset, low, high)
+        levels: Levels = by_raw.take(raw)
         if status.any():
             levels[(status & np.uint8(WITHOUT_VALUE)) != 0] = NO_VALUE
         return levels

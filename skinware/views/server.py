@@ -33,8 +33,9 @@ PAGE = Path(__file__).parent / "page"
 """The files that the browser runs."""
 
 _TICK_S = 0.01
-_LONGEST_S = 0.04
-"""Between two looks while there is news: plots want every snapshot, and the ring of a fast driver holds 64 of them."""
+"""Between two looks for a snapshot that a viewer waits for."""
+_LONGEST_S = 0.2
+"""Between two looks while no viewer waits: the next one looks by itself when it asks."""
 _LONGEST_TURN_S = 0.5
 _EARLY_S = 0.005
 """A turn may be sent this much earlier than the pace asks for."""
@@ -123,8 +124,9 @@ class ViewServer:
     def _follow(self) -> None:
         """Take what is new while there are viewers, send turns that are due, and come again in time."""
         try:
-            pauses_s = [self._take(show) for show in {viewer.show for viewer in self._viewers}]
-            if pauses_s:
+            for show in {viewer.show for viewer in self._viewers}:
+                self._take(show)
+            if self._viewers:
                 problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
                 self._doctor.follow([problem for problem in problems if NOTE not in problem])
                 for viewer in filter(self._is_due, self._viewers):
@@ -132,10 +134,18 @@ class ViewServer:
         except Exception as error:  # noqa: BLE001 - show() raises it
             self._failure.set_exception(error)
         else:
-            self._timer = asyncio.get_running_loop().call_later(min(pauses_s, default=_TICK_S), self._follow)
+            self._come_again()
 
-    def _take(self, show: Show) -> float:
-        """Take what is new of a show for its viewers, and return the time until it is worth looking again, s."""
+    def _come_again(self) -> None:
+        """Follow once it is worth it: when a turn is due, and before a ring has lost what a plot wants."""
+        pause_s = _LONGEST_S if self._viewers else _TICK_S
+        for viewer in self._viewers:
+            pause_s = min(pause_s, viewer.show.follower.slack_s / 2)
+            if viewer.wanted:
+                pause_s = min(pause_s, _next_s(viewer) - time.monotonic())
+        self._timer = asyncio.get_running_loop().call_later(max(pause_s, _TICK_S), self._follow)
+
+    def _take(self, show: Show) -> None:
         viewers = [viewer for viewer in self._viewers if viewer.show is show]
         period_s = 1 / max(viewer.look.fps for viewer in viewers)
         newer = show.follower.take(round(period_s * NS_PER_S))
@@ -144,9 +154,6 @@ class ViewServer:
                 viewer.look.follow(driver)
             viewer.plots.take()
         show.follow()
-        if not any(viewer.wanted for viewer in viewers):  # a question comes first
-            return _LONGEST_S
-        return min(max(period_s, _TICK_S), _LONGEST_S) if newer else _TICK_S
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         try:
@@ -208,13 +215,15 @@ class ViewServer:
                 self._do(viewer, looks.operation_of(text))
             except ConfigurationError as error:
                 viewer.refuse(str(error))
+            self._timer.cancel()
             if self._is_due(viewer):
-                self._timer.cancel()
                 self._follow()
+            else:
+                self._come_again()
 
     def _is_due(self, viewer: Viewer) -> bool:
         """Return whether a viewer waits for a turn, has taken the last one, and its pace allows the next."""
-        is_in_time = time.monotonic() >= viewer.sent_s + 1 / viewer.look.fps - _EARLY_S
+        is_in_time = time.monotonic() >= _next_s(viewer) - _EARLY_S
         return is_in_time and viewer.wanted > 0 and not self._viewers[viewer].transport.get_write_buffer_size()
 
     def _send(self, viewer: Viewer) -> None:
@@ -261,6 +270,11 @@ class ViewServer:
             if self._recording.problem is not None:
                 besides["problems"].append(problem_of_all(f"recording: {self._recording.problem}"))
         return besides
+
+
+def _next_s(viewer: Viewer) -> float:
+    """Return when the next turn of a viewer keeps its pace, CLOCK_MONOTONIC."""
+    return viewer.sent_s + 1 / viewer.look.fps
 
 
 def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:

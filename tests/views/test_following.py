@@ -20,6 +20,7 @@ from tests.cli.fake_skin import FakeSkin, fake_structure
 @pytest.fixture(autouse=True)
 def look_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skinware.drivers.LOOK_EVERY_NS", 0)
+    monkeypatch.setattr("skinware.views.following._LOOK_EVERY_NS", 0)
 
 
 def names(follower: Follower) -> list[str]:
@@ -135,7 +136,7 @@ def test_a_driver_that_goes_at_the_worst_moment(namespace: Namespace, monkeypatc
             raise ServiceNotFound("gone")
 
         with monkeypatch.context() as patch:
-            patch.setattr("skinware.drivers.LOOK_EVERY_NS", 200_000_000)
+            patch.setattr(follower.origins[0].live._drivers, "_every_ns", 200_000_000)
             follower.take(0)
             patch.setattr(DriverReader, "refresh", gone)
             assert names(follower) == names(follower) == []

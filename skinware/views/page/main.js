@@ -34,6 +34,8 @@ import { progressOf, Wipe } from "./wipe.js";
 
 const MODES = { raw: "Values", change: "Change", peak: "Peaks", wipe: "Wipe test" };
 const [TURN, NEARER, SCROLL_S] = [0.12, 0.85, 0.2]; // of a key: rad, of the distance, s
+const FPS = 30; // turns a second, at most
+const PACE_MS = 1000 / FPS - 4; // from a turn to the request for the next, so that the server need not wait itself
 const FIGURES_EVERY_MS = 250; // figures that change more often cannot be read
 
 const wanted = address.fromHash(location.hash);
@@ -158,6 +160,7 @@ function disconnected(reason, wait_ms) {
 }
 
 function turn(message) {
+  const due_ms = performance.now() + PACE_MS;
   const taken = decode(message);
   const { header } = taken;
   if (!now.isAlive) alive();
@@ -176,7 +179,11 @@ function turn(message) {
   }
   if (performance.now() - now.figures_ms > FIGURES_EVERY_MS) showFigures();
   else plotting.strips.draw(false);
-  afterFrame(() => link.next());
+  afterFrame(() => {
+    const wait_ms = due_ms - performance.now();
+    if (wait_ms > 0) setTimeout(() => link.next(), wait_ms);
+    else link.next();
+  });
 }
 
 function restructured() {
@@ -319,7 +326,7 @@ function choose(row) {
 // -- what a person does -------------------------------------------------------------------------------------------
 
 function sendLook() {
-  send({ op: "look", mode: view.mode, type: view.type, scale: view.scale, fps: 30 });
+  send({ op: "look", mode: view.mode, type: view.type, scale: view.scale, fps: FPS });
 }
 
 /** Look otherwise: at another mode, type or scale. */

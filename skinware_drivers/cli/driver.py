@@ -8,7 +8,6 @@ import logging
 import os
 import signal
 import sys
-from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +42,7 @@ def _options_of(given: Mapping[str, Any]) -> tuple[str, type[msgspec.Struct]]:
     from skinware_drivers.loading import short_name
     from skinware_drivers.registry import DEFAULT_DRIVER, load_driver
 
-    name = given.get("driver_name")
+    name = given.get("driver")
     if not name and given.get("config"):
         name = ConfigFile(Path(given["config"])).settings.driver
     if not name:
@@ -87,7 +86,6 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 )
 @click.option(
     "--driver",
-    "driver_name",
     metavar="DRIVER",
     help="Driver of the hardware: roboskin, xela, anyskin ..., or the file of your own.  [default: roboskin]",
 )
@@ -119,9 +117,8 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 )
 @click.option(
     "--geometry",
-    "geometry_file",
     metavar="FILE",
-    type=cli.FILE,
+    type=click.Path(),
     help="TOML file with the positions of the sensors, which the driver publishes.",
 )
 @cli.group_option
@@ -144,7 +141,15 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
 @cli.namespace_option
 @cli.json_option
 @cli.verbose_option
-def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) -> None:
+def command(
+    buses: tuple[str, ...],
+    config: Path | None,
+    namespace: str | None,
+    as_json: bool,
+    verbose: bool,
+    capture: Path | None,
+    **given: Any,
+) -> None:
     """Run a driver: skin hardware on one or more buses into one stream of snapshots for any program.
 
     With several buses, the driver starts with those that are available; the others join when they appear.
@@ -156,13 +161,13 @@ def command(as_json: bool, verbose: bool, capture: Path | None, **given: Any) ->
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
     """
-    from skinware_drivers.cli.driver_setup import DriverArguments, DriverSetup
+    from skinware_drivers.cli.driver_setup import DriverConfig, DriverSetup
     from skinware_drivers.running.generation import FlowLoop
 
     cli.log_to_stderr(verbose)
-    names = {field.name for field in fields(DriverArguments)}
-    own = {name: given.pop(name) for name in names & given.keys()}
-    setup = DriverSetup(DriverArguments(hardware=hardware_values(given), **own))
+    own = {name: given.pop(name) for name in DriverConfig.__struct_fields__ if name in given}
+    hardware = hardware_values(given)
+    setup = DriverSetup(own, buses=buses, hardware=hardware, config=config, namespace=namespace)
     runner = setup.make_runner(
         on_ready=lambda: print_ready(runner, as_json),
         on_patches=lambda change: print_patches(runner, change) if as_json else None,

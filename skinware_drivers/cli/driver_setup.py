@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -39,7 +38,6 @@ from skinware_drivers.cli.capturing import driver_of_recording, only_listened, o
 from skinware_drivers.loading import short_name
 from skinware_drivers.options import is_file, options_from_strings
 from skinware_drivers.registry import DEFAULT_DRIVER, NamedBus, load_driver
-from skinware_drivers.running.building import PublishMode
 from skinware_drivers.running.guard import hook
 from skinware_drivers.running.runner import Runner
 
@@ -61,16 +59,18 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole file.
+    """A whole file, or what a command line says of it.
 
     Attributes:
         driver: name of a registered driver, or a file ``./my_skin.py``, relative to this file.
         wait: if no bus is available at the start, wait for one.
         publish: ``cycle``, ``rate`` or ``request``; empty: as the driver does.
+        slots: size of the ring; None: the default.
         latency_ms: longest time that frames may wait so that more are taken with them, 0 to 1000; None: the default.
         realtime: a profile as :meth:`skinware.realtime.Profile.from_text` reads it.
         cpus: CPUs to stay on; empty for any.
         geometry: file with the positions of the sensors, relative to this file; empty: they are not published.
+        group: whose members may read the namespace; empty: no group.
     """
 
     driver: str = ""
@@ -78,10 +78,12 @@ class DriverConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     listen_only: bool = False
     wait: bool = False
     publish: Literal["", "cycle", "rate", "request"] = ""
+    slots: Annotated[int, msgspec.Meta(ge=2, le=64)] | None = None
     latency_ms: Annotated[float, msgspec.Meta(ge=0, le=1000)] | None = None
     realtime: str | None = None
     cpus: tuple[int, ...] = ()
     geometry: str = ""
+    group: str = ""
     options: dict[str, Any] = {}
     bus: tuple[BusConfig, ...] = ()
 
@@ -175,52 +177,50 @@ def _check_keys(struct: type[msgspec.Struct], data: object, place: Keys = (), hi
             raise _Wrong(f"{of_bus}unknown key {key!r}{nearest_name(key, sorted(known))}{hint}", (*place, key))
 
 
-@dataclass(frozen=True)
-class DriverArguments:
-    """The command line; ``hardware`` has the texts of the driver's own options."""
-
-    hardware: Mapping[str, str]
-    buses: tuple[str, ...] = ()
-    driver_name: str | None = None
-    name: str | None = None
-    config: Path | None = None
-    listen_only: bool = False
-    wait: bool = False
-    publish: PublishMode | None = None
-    slots: int | None = None
-    latency_ms: float | None = None
-    geometry_file: Path | None = None
-    group: str | None = None
-    realtime: str | None = None
-    cpus: str | None = None
-    namespace: str | None = None
-
-
 class DriverSetup:
-    """A driver with its buses and options; ``profile``: how it is scheduled, None: as any program."""
+    """A driver with its buses and options.
 
-    def __init__(self, arguments: DriverArguments) -> None:
-        self._arguments = arguments
-        file = self._file = ConfigFile(arguments.config)
-        settings = file.settings
-        buses = list(arguments.buses) or [bus.name for bus in settings.bus]
-        named = arguments.driver_name or settings.driver or driver_of_recording(buses)
+    Args:
+        given: the settings of the command line, by the names in ``DriverConfig``; None or False: not given.
+        buses: of the command line, instead of those of the file.
+        hardware: the texts of the driver's own options.
+        config: the file.
+
+    Attributes:
+        profile: how it is scheduled; None: as any program.
+    """
+
+    def __init__(
+        self,
+        given: Mapping[str, Any],
+        *,
+        buses: Sequence[str],
+        hardware: Mapping[str, str],
+        config: Path | None,
+        namespace: str | None,
+    ) -> None:
+        self._given = {name: value for name, value in given.items() if value is not None and value is not False}
+        if "cpus" in self._given:
+            self._given["cpus"] = cpus_from_text(self._given["cpus"])
+        self._given_buses, self._hardware, self._config = buses, hardware, config
+        self._file = ConfigFile(config)
+        settings = self._settings = self._with_given(self._file)
+        names = list(buses) or [bus.name for bus in settings.bus]
+        named = settings.driver or driver_of_recording(names)
         self._is_named, self._driver_name = bool(named), named or DEFAULT_DRIVER
         self._driver = load_driver(self._driver_name)
         self.driver_type = short_name(self._driver_name)
-        self.name = arguments.name or settings.name or self.driver_type
-        self.namespace = Namespace(arguments.namespace)
-        realtime = settings.realtime if arguments.realtime is None else arguments.realtime
-        cpus = settings.cpus if arguments.cpus is None else cpus_from_text(arguments.cpus)
+        self.name = settings.name or self.driver_type
+        self.namespace = Namespace(namespace)
         self.profile: Profile | None = None
-        if realtime is not None or cpus:
-            self.profile = Profile.from_text("normal" if realtime is None else realtime, cpus=cpus)
-        self._listen_only = arguments.listen_only or settings.listen_only or only_listened(buses)
-        if not buses:
+        if settings.realtime is not None or settings.cpus:
+            self.profile = Profile.from_text(settings.realtime or "normal", cpus=settings.cpus)
+        self._listen_only = settings.listen_only or only_listened(names)
+        if not names:
             raise ConfigurationError("which bus? give --bus (vcan0, can0, virtual ...) or a --config with one")
-        self._buses = self._named(buses)
+        self._buses = self._named(names)
         own = [bus.name for bus in settings.bus]
-        for name in arguments.buses:  # it would silently lack the options that the file has for its own buses
+        for name in buses:  # it would silently lack the options that the file has for its own buses
             if name not in own and any(bus.options for bus in settings.bus):
                 raise ConfigurationError(
                     f"--bus {name}: the file has options for {', '.join(own)} and none for this bus;"
@@ -229,8 +229,7 @@ class DriverSetup:
 
     def make_runner(self, on_ready: Callable[[], None], on_patches: Callable[[PatchChange], None]) -> Runner:
         """Return the driver, which does not run yet; see :class:`Runner` for the arguments."""
-        arguments, settings = self._arguments, self._file.settings
-        latency_ms = settings.latency_ms if arguments.latency_ms is None else arguments.latency_ms
+        settings, latency_ms = self._settings, self._settings.latency_ms
         adapters = [self._make_adapter(bus, self._file) for bus in self._buses]
         lines = [
             (bus.text, adapter, self._make_bus(bus, adapter, self._file))
@@ -241,32 +240,37 @@ class DriverSetup:
             lines,
             name=self.name,
             listen_only=self._listen_only,
-            wait_for_buses=arguments.wait or settings.wait,
-            publish=arguments.publish or settings.publish or None,
+            wait_for_buses=settings.wait,
+            publish=settings.publish or None,
             latency_s=None if latency_ms is None else latency_ms / 1e3,
             namespace=self.namespace,
-            slots=arguments.slots,
-            group=arguments.group,
-            geometry=self._geometry(settings),
+            slots=settings.slots,
+            group=settings.group or None,
+            geometry=_geometry(settings),
             on_ready=on_ready,
             on_patches=on_patches,
         )
 
     async def read_again(self, runner: Runner) -> None:
         """Read the files again, and change the buses and places of a running driver to what they say now."""
-        file = ConfigFile(self._arguments.config)
-        settings, geometry = file.settings, self._geometry(file.settings)
-        if self._arguments.config is not None and not self._arguments.buses:  # those of the command line stay
+        file = ConfigFile(self._config)
+        settings = self._with_given(file)
+        geometry = _geometry(settings)
+        if self._config is not None and not self._given_buses:  # those of the command line stay
             wanted_driver = settings.driver or DEFAULT_DRIVER
-            if not self._arguments.driver_name and wanted_driver != self._driver_name:
+            if wanted_driver != self._driver_name:
                 raise ConfigurationError(
-                    f"{self._arguments.config}: driver = {wanted_driver!r}, and {self._driver_name!r} is running: stop"
-                    " it and start it again"
+                    f"{self._config}: driver = {wanted_driver!r}, and {self._driver_name!r} is running: stop it and"
+                    " start it again"
                 )
             buses = {bus.text: bus for bus in self._named([bus.name for bus in settings.bus])}
             adapters = {name: self._make_adapter(bus, file) for name, bus in buses.items()}
             await runner.buses.change_to(adapters, lambda name, adapter: self._make_bus(buses[name], adapter, file))
         await runner.change_geometry(geometry)
+
+    def _with_given(self, file: ConfigFile) -> DriverConfig:
+        """Return the settings of the file, except where the command line has others."""
+        return msgspec.structs.replace(file.settings, **self._given)
 
     def _named(self, texts: Sequence[str]) -> list[NamedBus]:
         """Refuse a bus that is named twice: its boards would be set up twice."""
@@ -279,7 +283,7 @@ class DriverSetup:
 
     def _make_adapter(self, bus: NamedBus, file: ConfigFile) -> AnyAdapter:
         recorded = options_of_recording(bus.text, self.driver_type)
-        options = file.options_of_bus(self._driver.Options, bus.text, self._arguments.hardware, recorded)
+        options = file.options_of_bus(self._driver.Options, bus.text, self._hardware, recorded)
         with file.blamed_for(bus.text):
             with hook("__init__", bus.text):
                 adapter = bus.choose(self._driver)(options)
@@ -296,6 +300,6 @@ class DriverSetup:
                 )
             return made
 
-    def _geometry(self, settings: DriverConfig) -> Geometry | None:
-        path = self._arguments.geometry_file or settings.geometry
-        return read_geometry(path) if path else None
+
+def _geometry(settings: DriverConfig) -> Geometry | None:
+    return read_geometry(settings.geometry) if settings.geometry else None

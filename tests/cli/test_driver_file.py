@@ -14,7 +14,7 @@ import pytest
 from skinware import DriverReader
 from skinware.cli._command import exit_status
 from skinware_drivers.cli import config, driver, emulate, find
-from skinware_drivers.cli.driver_setup import ConfigFile
+from skinware_drivers.cli.driver_setup import ConfigFile, DriverSetup
 from skinware_drivers.registry import load_driver
 from skinware_drivers.virtual.hardware import load_emulator
 from tests.commands import running
@@ -195,3 +195,12 @@ def test_a_name_that_is_not_known_may_be_meant_as_a_file(capsys: pytest.CaptureF
     text = told(capsys, driver.command, "--driver", "my_skin", "--bus", "virtual", status=2)
     assert "there is no driver 'my_skin'" in text
     assert "One of yours: give its file, as ./my_skin.py, or install its package" in text
+
+
+def test_the_command_line_comes_before_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "arm.toml"
+    file.write_text('name = "arm"\nslots = 4\nlatency_ms = 3\ngroup = "lab"\n[[bus]]\nname = "virtual"\n')
+    given = {"slots": 8, "latency_ms": 0.0, "group": None, "listen_only": False}
+    setup = DriverSetup(given, buses=(), hardware={}, config=file, namespace=None)
+    settings = setup._settings
+    assert (setup.name, settings.slots, settings.latency_ms, settings.group) == ("arm", 8, 0.0, "lab")

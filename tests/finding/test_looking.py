@@ -179,7 +179,7 @@ class Hangs(Answers):
         return "late"
 
 
-class ModelOptions(RoboskinOptions, frozen=True):
+class ModelOptions(RoboskinOptions, frozen=True, kw_only=True):
     model: str
 
 

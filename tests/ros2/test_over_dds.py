@@ -14,6 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+pytest.importorskip("cyclonedds", reason="needs the extra ros2")
+
+
 from skinware import DriverReader, Namespace
 from skinware.conversion.showing import in_topic
 from skinware.errors import BridgeError, ConfigurationError

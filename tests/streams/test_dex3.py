@@ -13,6 +13,9 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+
+pytest.importorskip("cyclonedds", reason="needs the extra ros2")
+
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader

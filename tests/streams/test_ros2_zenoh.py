@@ -15,6 +15,9 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("cyclonedds", reason="needs the extra ros2")
+
+
 from skinware import DriverReader, Namespace
 from skinware.errors import ConfigurationError
 from skinware.ros2.rmw_zenoh import MessageAttachment, ZenohNode

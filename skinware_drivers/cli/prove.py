@@ -320,13 +320,13 @@ def _driver_of(capture: Path, arguments: Sequence[str]) -> tuple[type[AnyAdapter
 
     if not arguments:
         return None, {}
-    name = own_values(driver_command, arguments).get("driver_name") or driver_type_of(capture)
+    name = own_values(driver_command, arguments).get("driver") or driver_type_of(capture)
     context = driver_command.make_context("skin-driver", ["--driver", name, *arguments])
     driver = load_driver(name)
     chosen = {
         key: text
         for key, text in context.params.items()
-        if context.get_parameter_source(key) is ParameterSource.COMMANDLINE and key != "driver_name"
+        if context.get_parameter_source(key) is ParameterSource.COMMANDLINE and key != "driver"
     }
     for option in driver_command.params:
         if option.name in chosen:

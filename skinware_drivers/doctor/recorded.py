@@ -158,10 +158,9 @@ class _DriverTrack:
 def _continued(now: tuple[_PartT, ...], before: tuple[_PartT, ...]) -> tuple[_PartT, ...]:
     """Return buses or patches with the counters that they had under the same name before the structure changed."""
     earlier = {part.name: part for part in before}
-    found = []
-    for part in now:
-        if (old := earlier.get(part.name)) is not None:
-            counted = Counted(part.counted.total, dict(Counter(old.counted.grown) + Counter(part.counted.grown)))
-            part = replace(part, counted=counted, changes=(*old.changes, *part.changes))
-        found.append(part)
-    return tuple(found)
+    return tuple(_after(earlier[part.name], part) if part.name in earlier else part for part in now)
+
+
+def _after(old: _PartT, part: _PartT) -> _PartT:
+    counted = Counted(part.counted.total, dict(Counter(old.counted.grown) + Counter(part.counted.grown)))
+    return replace(part, counted=counted, changes=(*old.changes, *part.changes))

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import threading
+import time
 from collections import deque
 from typing import Any, ClassVar
 
@@ -42,6 +43,8 @@ _LISTENING: dict[str, dict[str, Any]] = {
 _WITHOUT_CONTROLLER = ("udp_multicast", "virtual")
 _ECHOING = ("udp_multicast",)
 """Interfaces that always receive the frames that they send."""
+_STAMPED_BY_KERNEL = ("udp_multicast",)
+"""Interfaces whose messages have the kernel's time of arrival, CLOCK_REALTIME (python-can's sources)."""
 _ECHO_NS = NS_PER_S
 """An echo that has not come by then was lost."""
 
@@ -52,8 +55,8 @@ class PythonCanBus(Bus):
     The exceptions of these interfaces and the libraries below them are not documented, and change: after any of them
     the bus has failed and is opened again.
 
-    Frames are stamped when they arrive here, as the clock of most interfaces' own stamps is unknown. The options are
-    those of the interface's class.
+    Frames are stamped when they arrive here, as the clock of most interfaces' own stamps is unknown; those of
+    ``udp_multicast`` are the kernel's. The options are those of the interface's class.
 
     Args:
         interface: python-can's name of the interface.
@@ -93,7 +96,8 @@ class PythonCanBus(Bus):
             why = f"bus {self.interface}:{self.channel} cannot be opened: {error}"
             raise BusNotAvailable(why, reason=BusReason.FAILED) from None
         self._was_open = True
-        self._messages = _MessageQueue(self._bus, f"bus {self.interface}:{self.channel}", self.counters)
+        is_stamped = self.interface in _STAMPED_BY_KERNEL
+        self._messages = _MessageQueue(self._bus, f"bus {self.interface}:{self.channel}", self.counters, is_stamped)
 
     @property
     def note(self) -> str:
@@ -192,11 +196,12 @@ class _MessageQueue:
         fd: an eventfd that is written when one of the two changes; the thread owns and closes it.
     """
 
-    def __init__(self, bus: can.BusABC, name: str, counters: BusCounters) -> None:
+    def __init__(self, bus: can.BusABC, name: str, counters: BusCounters, is_stamped: bool) -> None:
         self.queue: deque[tuple[int, int, bytes, int]] = deque()
         self.failure: str | None = None
         self.fd: int = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._bus, self._name, self._counters = bus, name, counters
+        self._bus, self._name, self._counters, self._is_stamped = bus, name, counters, is_stamped
+        self._last_ns = now_ns()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
@@ -252,8 +257,16 @@ class _MessageQueue:
             if message.is_fd:
                 flags = IS_FD | (_SWITCHED if message.bitrate_switch else 0)
                 flags |= _PASSIVE if message.error_state_indicator else 0
-            self.queue.append((now_ns(), identifier, payload, flags))
+            self.queue.append((self._arrival_ns(message), identifier, payload, flags))
             os.eventfd_write(self.fd, 1)
+
+    def _arrival_ns(self, message: can.Message) -> int:
+        """Return when a message came, CLOCK_MONOTONIC ns; not before the last one, if the other clock steps."""
+        came_ns = now_ns()
+        if self._is_stamped:
+            came_ns = min(came_ns, max(self._last_ns, came_ns - time.time_ns() + round(message.timestamp * NS_PER_S)))
+        self._last_ns = came_ns
+        return came_ns
 
 
 def _typed(text: str) -> int | float | bool | str:

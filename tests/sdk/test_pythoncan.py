@@ -8,10 +8,12 @@ import select
 import signal
 import socket
 import threading
+import time
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import can
 import pytest
@@ -20,7 +22,9 @@ from can.interfaces.virtual import VirtualBus
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware.status import BusReason
 from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch
-from skinware_drivers.can.pythoncan import PythonCanBus
+from skinware_drivers.can import pythoncan
+from skinware_drivers.can.pythoncan import PythonCanBus, _MessageQueue
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import running
 from tests.streams.peers import free_port
@@ -256,3 +260,29 @@ def test_a_driver_ends_though_the_library_of_its_only_bus_hangs(tmp_path: Path) 
         "opening",
         "skin-driver: bus slcan:/dev/ttyACM0: its interface is still being opened, and is left to itself",
     ]
+
+
+def test_the_kernels_time_of_arrival_counts_not_that_of_reading(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two frames are read late, and then the other clock is set forward and back: times never go back, or ahead."""
+    second = 1_000_000_000
+    now, wall = [5 * second], [100 * second]
+    monkeypatch.setattr(pythoncan, "now_ns", lambda: now[0])
+    monkeypatch.setattr(time, "time_ns", lambda: wall[0])
+    monkeypatch.setattr(_MessageQueue, "_work", lambda _: None)
+    stamped, other = (
+        _MessageQueue(cast("can.BusABC", None), "", BusCounters(), by_kernel) for by_kernel in (True, False)
+    )
+
+    def age(messages: _MessageQueue, wall_s: float) -> int:
+        return now[0] - messages._arrival_ns(can.Message(timestamp=wall_s))
+
+    now[0] += second
+    wall[0] += second
+    assert [age(stamped, 100.5), age(stamped, 100.75), age(other, 100.5)] == [second // 2, second // 4, 0]
+    wall[0] += 3600 * second
+    assert age(stamped, 101) == second // 4
+    wall[0] -= 7200 * second
+    assert age(stamped, 101) == 0
+    for messages in (stamped, other):
+        messages.close()
+        os.close(messages.fd)

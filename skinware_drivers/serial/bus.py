@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -87,7 +88,7 @@ class SerialBus(KernelBus):
         """
         self._framing, self._commands = framing, commands or framing
         self._baudrate = baudrate or self._baudrate
-        self._restart(*self._stream.rest())
+        self._restart(self._stream.rest())
         if self._port is not None:
             self._stay_readable(self._stream.is_behind)
 
@@ -185,12 +186,14 @@ class SerialBus(KernelBus):
     def note(self) -> str:
         return "" if self._port is None else self._port.note
 
-    def _restart(self, kept: bytes = b"", time_ns: int = 0) -> None:
-        self.counters.framing.skipped_bytes += self._stream.pending - len(kept)
-        self.counters.framing.bytes_in -= len(kept)
+    def _restart(self, rest: Sequence[tuple[bytes, int]] = ()) -> None:
+        kept = sum(len(piece) for piece, _ in rest)
+        if kept > CHUNK:
+            kept, rest = 0, ()
+        self.counters.framing.skipped_bytes += self._stream.pending - kept
+        self.counters.framing.bytes_in -= kept
         self._stream = stream_of(self._framing, self.payload_size, self.counters)
-        if kept:
-            self._stream.add(kept, time_ns)
+        self._stream.begin(rest)
         self._judged, self._judged_ns, self._is_garbled = replace(self.counters.framing), 0, False
 
     def _read(self, port: Port) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import ctypes
 from abc import ABC, abstractmethod
 from bisect import bisect_left
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import astuple, fields
 
 import numpy as np
@@ -133,8 +133,13 @@ class Stream(ABC):
         """Bytes that may still become part of a frame."""
 
     @abstractmethod
-    def rest(self) -> tuple[bytes, int]:
-        """Return the bytes that are pending, the last ``CHUNK`` at most, and when the last of them was read."""
+    def rest(self) -> list[tuple[bytes, int]]:
+        """Return the bytes that are pending, in pieces, each with the time at which it was read."""
+
+    def begin(self, rest: Sequence[tuple[bytes, int]]) -> None:
+        """Begin with the rest of the stream before."""
+        for piece, time_ns in rest:
+            self.add(piece, time_ns)
 
     def asked(self) -> None:  # noqa: B027  (most framings do not depend on questions)
         """Note that the host sends a question."""
@@ -152,6 +157,16 @@ class Stream(ABC):
         """Return the last chunk, once, if it had damaged frames and no good one."""
 
 
+def _pieces(pending: bytes, start: int, reads: Iterable[tuple[int, int]]) -> list[tuple[bytes, int]]:
+    """Return bytes in the pieces in which they were read; ``start`` and the ends of reads are places in the stream."""
+    pieces, place = [], 0
+    for end, time_ns in reads:
+        if end - start > place:
+            pieces.append((pending[place : end - start], time_ns))
+            place = end - start
+    return pieces
+
+
 class NativeStream(Stream):
     """A stream whose frames C finds, also while the event loop rests."""
 
@@ -163,7 +178,7 @@ class NativeStream(Stream):
         self._fill.restype = ctypes.c_int64
         self._arrays = arrays = structs.Arrays()
         compiled = framing.compiled(arrays)
-        undecided = max(framing.undecided, compiled.longest_segment)
+        self._room = undecided = max(framing.undecided, compiled.longest_segment)
         self._stream = structs.Stream(
             framing=arrays.structs(structs.Framing, [compiled])[1],
             payload_size=payload_size,
@@ -189,12 +204,18 @@ class NativeStream(Stream):
     def pending(self) -> int:
         return int(self._stream.size - self._stream.place)
 
-    def rest(self) -> tuple[bytes, int]:
-        stream, size = self._stream, min(self.pending, CHUNK)
-        if not size:
-            return b"", 0
-        last = structs.Reading.from_address(stream.reads + ctypes.sizeof(structs.Reading) * (stream.n_reads - 1))
-        return ctypes.string_at(stream.bytes + stream.size - size, size), last.time_ns
+    def rest(self) -> list[tuple[bytes, int]]:
+        stream = self._stream
+        reads = (structs.Reading * stream.n_reads).from_address(stream.reads)
+        pending = ctypes.string_at(stream.bytes + stream.place, self.pending)
+        return _pieces(pending, self.judged, [(read.end, read.time_ns) for read in reads])
+
+    def begin(self, rest: Sequence[tuple[bytes, int]]) -> None:
+        early, late = rest[: -self._room], rest[-self._room :]  # there is room for so many times
+        if early:
+            late = [(b"".join(piece for piece, _ in early), early[-1][1]), *late]
+        for piece, time_ns in late:
+            self._add(ctypes.byref(self._stream), piece, ctypes.c_int64(len(piece)), ctypes.c_int64(time_ns))
 
     @property
     def judged(self) -> int:
@@ -301,8 +322,9 @@ class PythonStream(Stream):
     def pending(self) -> int:
         return self._framer.pending
 
-    def rest(self) -> tuple[bytes, int]:
-        return self._framer.rest[-CHUNK:], self._reads[-1][1] if self._reads else 0
+    def rest(self) -> list[tuple[bytes, int]]:
+        framer = self._framer
+        return _pieces(framer.rest, framer.position - framer.pending, self._reads)
 
     def asked(self) -> None:
         self._framer.asked()

@@ -16,13 +16,15 @@ from skinware.errors import BusNotAvailable, BusSendError
 from skinware.realtime import now_ns
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.bus_names import parse_bus_name
+from skinware_drivers.counters import BusCounters
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial import bus as serial_bus
 from skinware_drivers.serial.bus import PtyBus, SerialBus
 from skinware_drivers.serial.checksums import CRC16_WEISS
 from skinware_drivers.serial.framing import Field, Unframed
+from skinware_drivers.serial.framings import Recurring
 from skinware_drivers.serial.packets import Length, Packet
-from skinware_drivers.serial.stream import PythonStream
+from skinware_drivers.serial.stream import PythonStream, stream_of
 from skinware_drivers.testing.waiting import wait_until
 from tests.serial.lines import ASK, DATA, FRAMING, data_frame, is_readable, line, opened, receive
 
@@ -342,3 +344,18 @@ def test_a_link_that_cannot_be_made(tmp_path: Path) -> None:
     with pytest.raises(BusNotAvailable, match="cannot make the link"):
         PtyBus(str(file)).open()
     assert file.read_text() == "precious"
+
+
+def test_bytes_that_wait_go_on_to_the_next_framing_with_their_times() -> None:
+    """Also more pieces than the next framing has room for."""
+    for many in (3, 60):
+        old = stream_of(Recurring(b"\xaa\x55", 60, 60), 64, BusCounters())
+        for number in range(many):
+            old.add(b"\xaa\x55"[number % 2 :][:1], 100 + number)
+        rest = old.rest()
+        assert rest == [(b"\xaa\x55"[n % 2 :][:1], 100 + n) for n in range(many)]
+        new = stream_of(Packet(sync=b"\xaa\x55", length=2), 8, BusCounters())
+        new.begin(rest)
+        batch = FrameBatch(64)
+        assert new.fill(batch, 0) == many // 2
+        assert batch.time_ns[batch.stop - 1] == 100 + many // 2 * 2 - 1

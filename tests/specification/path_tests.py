@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from typing import Literal
@@ -55,9 +55,13 @@ class BothStreams(Stream):
     def pending(self) -> int:
         return self._python.pending
 
-    def rest(self) -> tuple[bytes, int]:
+    def rest(self) -> list[tuple[bytes, int]]:
         self._compare("holds back", self._python.rest(), self._native.rest())
         return self._python.rest()
+
+    def begin(self, rest: Sequence[tuple[bytes, int]]) -> None:
+        self._python.begin(rest)
+        self._native.begin(rest)
 
     def add(self, chunk: bytes, time_ns: int) -> None:
         self._python.add(chunk, time_ns)

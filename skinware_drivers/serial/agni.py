@@ -12,8 +12,8 @@ Wire format: agni_serial_protocol, ``serial_protocol_defines.h`` and ``serial_pr
 * Alive (id F0): empty. Errors (id FE): u8 - F0 checksum, F1 unknown command, F2 unknown sensor; 01 to EE is the length
   of a text that follows (read_error): such errors are skipped as noise.
 
-The wire does not say of which type the values of a sensor are: option ``values``, for all sensors of a line. That
-program does not say of which unit the device's time is: option ``time_unit_us``.
+The wire does not say of which type the values of a sensor are: options ``devices`` and ``values``. That program does
+not say of which unit the device's time is: option ``time_unit_us``.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ import numpy as np
 from msgspec import Meta
 
 from skinware.errors import BusError
-from skinware.sensor_types import PRESSURE
 from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
-from skinware_drivers.fields import DeviceTime, Identifier
-from skinware_drivers.layout import Frame, Layout, Values
+from skinware_drivers.fields import DeviceTime
+from skinware_drivers.layout import Layout
 from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
+from skinware_drivers.serial.agni_devices import DEVICES, TIME, AgniDevice, Name, frames_of
 
 _BEGIN = b"\xf0\xc4"
 _IN_A_MS = 10
@@ -38,7 +38,6 @@ _LONGEST_MS = 0xFFFF // _IN_A_MS
 _CONFIGURATION, _START, _STOP, _PERIOD, _ALIVE, _ERROR = 0xC0, 0xF1, 0x00, 0xD0, 0xF0, 0xFE
 _MOST_SENSORS = 0xC9
 _MOST_BYTES = 4096  # of a sensor's payload
-_TIME = 4
 _TIMEOUT_S, _TRIES = 0.5, 3
 _ERRORS = {0xF0: "a wrong checksum", 0xF1: "an unknown command", 0xF2: "an unknown sensor"}
 
@@ -51,8 +50,13 @@ class AgniOptions(Options, frozen=True):
     descriptors: Annotated[Literal["little", "big"], Meta(description="byte order of the sensor descriptors")] = (
         "little"
     )
+    devices: Annotated[
+        tuple[Name, ...],
+        Meta(description="the makers' name of each sensor, in order; the last one is also that of all others"),
+    ] = ("undefined",)
     values: Annotated[
-        Literal["u1", "i1", "<u2", ">u2", "<i2", ">i2", "<f4"], Meta(description="numpy dtype of the values")
+        Literal["u1", "i1", "<u2", ">u2", "<i2", ">i2", "<f4"],
+        Meta(description="numpy dtype of the values of an undefined sensor"),
     ] = "<u2"
     time_unit_us: Annotated[float, Meta(ge=0, description="unit of the device's time; 0: the time of receipt")] = 0.0
 
@@ -79,8 +83,15 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self._configuration = b""
         self._patch: Patch | None = None
         self._n_sensors = 0
-        self.types = [PRESSURE.measured(unit="counts")]
-        self.dtype = np.dtype(options.values).newbyteorder("=")
+        undefined = AgniDevice(options.values, size=np.dtype(options.values).itemsize)
+        self._devices = {"undefined": undefined, **DEVICES}
+        known = [self._devices[name] for name in options.devices or ("undefined",)]
+        self.types = list(dict.fromkeys(kind for device in known for kind in device.types))
+        dtypes = [np.dtype(device.dtype).newbyteorder("=") for device in known]
+        self.dtype = np.dtype(np.float32)
+        if not any(dtype.kind == "f" for dtype in dtypes):
+            common = np.result_type(*dtypes)
+            self.dtype = np.dtype(np.int16) if common == np.int8 else common
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask the device for its sensors; it may still be sending for an earlier program."""
@@ -95,30 +106,40 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             raise BusError(f"the device speaks version {version} of the protocol, this driver version 1")
         order = "<" if self.options.descriptors == "little" else ">"
         sensors = list(struct.iter_unpack(f"{order}HH", configuration[3:]))
-        size = np.dtype(self.options.values).itemsize
-        for number, (kind, length) in enumerate(sensors, 1):
-            if not 0 < length <= _MOST_BYTES or length % size:
-                raise BusError(
-                    f"sensor {number} of type {kind} has {length} bytes: no whole number of values"
-                    f" {self.options.values!r} up to {_MOST_BYTES} bytes; look at the options values and descriptors"
-                )
         modules, frames, first_uid = [], [], 0
         time = DeviceTime(0, "<u4", self.options.time_unit_us / 1e6) if self.options.time_unit_us else None
         for number, (kind, length) in enumerate(sensors, 1):
-            count = length // size
-            modules.append(Module([Sensor("pressure", first_uid + n) for n in range(count)], number, f"type {kind}"))
-            values = Values(_TIME, self.options.values, count)
-            frames.append(
-                Frame(f"sensor {number}", [Identifier(number)], [_TIME + length], values, module=number, time=time)
-            )
+            name = self._name(number)
+            known = self._devices[name]
+            count = known.count(length) if length <= _MOST_BYTES else 0
+            if not count:
+                raise BusError(
+                    f"sensor {number} of type {kind} has {length} bytes: {self._wanted(name)}, up to {_MOST_BYTES}"
+                    " bytes; look at the options devices, values and descriptors"
+                )
+            names = [of_value.name for of_value in known.types] * (count // len(known.types))
+            channels = [Sensor(what, first_uid + n) for n, what in enumerate(names)]
+            modules.append(Module(channels, number, f"type {kind}", "" if name == "undefined" else name))
+            frames += frames_of(name, known, number, length, time, self.period_s)
             first_uid += count
         link.log.info("device %d with %d sensors", device, n_sensors)
         self.layout = Layout(frames)
-        totals = {number: 3 + _TIME + length + 1 for number, (_, length) in enumerate(sensors, 1)}
+        totals = {number: 3 + TIME + length + 1 for number, (_, length) in enumerate(sensors, 1)}
         self.change_framing(_framing({**totals, 0: 7 + 4 * n_sensors, _ALIVE: 4, _ERROR: 5}, 2))
         self._configuration, self._n_sensors = configuration, n_sensors
         self._patch = Patch(f"device {device}", modules)
         return [self._patch]
+
+    def _name(self, number: int) -> Name:
+        """Return the makers' name of sensor ``number``, from 1 on."""
+        names = self.options.devices or ("undefined",)
+        return names[min(number, len(names)) - 1]
+
+    def _wanted(self, name: Name) -> str:
+        if name == "undefined":
+            return f"no whole number of values {self.options.values!r}"
+        known = self._devices[name]
+        return f"{name} sends {known.size}" + ("" if known.is_single else " for each value")
 
     @classmethod
     async def identify(cls, link: Link, *, idle: bool) -> str:  # noqa: ARG003

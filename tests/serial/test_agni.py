@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import re
+import struct
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 
-from skinware import PatchState
+from skinware import PatchState, Status
 from skinware.errors import RequestFailed
 from skinware_drivers.link import Link
 from skinware_drivers.registry import make_bus
 from skinware_drivers.serial.agni import AgniDriver, AgniOptions, command
 from skinware_drivers.testing.driving import emulated_skin
+from skinware_drivers.testing.vectors import Shown, decode_stream
+from skinware_drivers.virtual import Device
 from skinware_drivers.virtual.devices.agni import EmulatedAgni, EmulatedAgniOptions, message
 from tests.sdk.driving import read_until, restarted_on_demand
 from tests.serial.spoken import Spoken
@@ -89,3 +94,95 @@ def test_it_is_set_up_again_after_a_restart_and_damage_is_not_shown() -> None:
             frame = read_until(reader, lambda f, live=live: (f.patch_state[0] == PatchState.LIVE) == live)  # type: ignore[misc]
             for module in (0, 1):
                 assert len(set(frame.values[frame.structure.module_index(module)].tolist())) == 1
+
+
+# -- the sensors that the makers' library knows by name
+
+SOURCE: dict[str, tuple[str, list[float]]] = {
+    "MID_tactile_fingertip_teensy": ("0100 FFFF", [1, 65535]),
+    "BMP388modified_pressure_array": ("0100 FFFF", [1, -1]),
+    "tactile_glove_teensy": ("01 FF0F 00 01A0", [4094, 0]),
+    "tactile_glove_teensy_bend": ("00 0000 01 FF1F", [4095, 0]),
+    "Generic_position_sensors_float": ("0000803F 000000C0", [1, -2]),
+    "BNO055": ("0100 0200 0300 0400 0500 0600 0700 0800 0900 0A00 0B00 0C00 FFFF", [*range(1, 13), -1]),
+    "BMA255": ("0100 0080 FF7F", [1, -32768, 32767]),
+    "mpl115a2": ("0000803F", [1]),
+    "AS5013": ("7F80", [127, -128]),
+    "AS5013_y_position": ("FF", [-1]),
+}
+"""Bytes, and what the library takes them for: by hand, after ``registered_sensors_impl.h``."""
+
+
+def decoded(name: str, payloads: Sequence[bytes]) -> Shown:
+    """What the driver shows of a device with one sensor that sends these payloads."""
+    driver = AgniDriver(AgniOptions(devices=(name,)))  # type: ignore[arg-type]
+
+    class Described(EmulatedAgni):
+        def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
+            if command == CONFIGURATION:
+                return message(0, bytes((1, 7, 1)) + struct.pack("<HH", 9, len(payloads[0])))
+            return b""
+
+    stream = b"".join(message(1, bytes(4) + payload) for payload in payloads)
+    decode_stream(driver, b"", strict=False, devices=Described(EmulatedAgniOptions()))  # then it knows the framing
+    return decode_stream(driver, stream, strict=False, devices=Described(EmulatedAgniOptions()))
+
+
+@pytest.mark.parametrize("name", SOURCE)
+def test_values_as_the_makers_library_reads_them(name: str) -> None:
+    sent, values = SOURCE[name]
+    shown = decoded(name, [bytes.fromhex(sent)])
+    assert shown.values.tolist() == values
+    assert not shown.status.any()
+
+
+def test_taxels_of_myrmex_lie_where_the_makers_library_has_them() -> None:
+    words = [index % 16 << 12 | index for index in range(256)]
+    shown = decoded("tactile_module_16x16_v2", [struct.pack("<256H", *words)]).values.reshape(16, 16)
+    assert shown[0].tolist() == [208, 224, 32, 0, 209, 225, 33, 1, 210, 226, 34, 2, 211, 227, 35, 3]
+    assert shown[:, 0].tolist() == [208, 192, 176, 160, 212, 196, 180, 164, 216, 200, 184, 168, 220, 204, 188, 172]
+    assert sorted(shown.ravel().tolist()) == list(range(256))
+
+
+def test_iobject_has_a_channel_in_each_message() -> None:
+    def words(channel: int) -> bytes:
+        return struct.pack("<60H", *(channel << 12 | 100 * channel + n for n in range(60)))
+
+    mixed = bytearray(words(3))
+    mixed[-1] ^= 0x10
+    shown = decoded("iobject_myrmex", [*map(words, range(15)), bytes(mixed)])
+    taxels = shown.values.reshape(60, 16)
+    assert taxels[:30, 5].tolist() == list(range(500, 560, 2))
+    assert taxels[30:, 5].tolist() == list(range(501, 560, 2))
+    assert ((shown.status & Status.NEVER_SEEN) != 0).reshape(60, 16).any(0).tolist() == [False] * 15 + [True]
+
+
+def test_no_measurement_of_an_inertial_sensor() -> None:
+    shown = decoded("BNO055", [b"\xa5" * 26])
+    assert (shown.status == Status.SUSPECT).all()
+    assert shown.structure.module_name.tolist() == [b"BNO055"]
+
+
+@pytest.mark.parametrize(
+    ("name", "length", "message"),
+    [
+        ("undefined", 3, "no whole number of values '<u2'"),
+        ("tactile_glove_teensy", 4, "tactile_glove_teensy sends 3 for each value"),
+        ("BNO055", 24, "BNO055 sends 26"),
+        ("tactile_module_16x16_v2", 256, "tactile_module_16x16_v2 sends 512"),
+    ],
+)
+def test_a_sensor_that_is_another(name: str, length: int, message: str) -> None:
+    with pytest.raises(pytest.fail.Exception, match=f"sensor 1 of type 9 has {length} bytes: {re.escape(message)}"):
+        decoded(name, [bytes(length)])
+
+
+def test_an_emulated_device_with_several_of_them() -> None:
+    names = ("tactile_module_16x16_v2", "iobject_myrmex", "tactile_glove_teensy", "BNO055", "AS5013", "mpl115a2")
+    emulated: dict[str, Any] = {"pattern": "cycle", "devices": names, "sensors": (1, 1, 20, 1, 1, 1)}
+    with emulated_skin(AgniDriver, EmulatedAgni, driver_options={"devices": names}, **emulated) as skin:
+        frame = read_until(skin.reader, lambda f: not (f.status & ~Status.SUSPECT).any() and f.values[0] > 16)
+        assert frame.structure.n_sensors == 256 + 960 + 20 + 13 + 2 + 1
+        for module in (0, 2, 3, 4, 5):
+            assert len(set(frame.values[frame.structure.module_index(module)].tolist())) == 1
+        assert len(set(frame.values[frame.structure.module_index(1)].tolist())) == 16

@@ -1,6 +1,7 @@
 """An emulated device of the AGNI serial protocol.
 
-Source: agni_serial_protocol, ``serial_protocol_defines.h`` (BSD); the vectors in tests/serial/test_agni.py.
+Source: agni_serial_protocol, ``serial_protocol_defines.h`` (BSD), and for the sensors that its library knows by name
+``registered_sensors_impl.h``; the vectors in tests/serial/test_agni.py.
 """
 
 from __future__ import annotations
@@ -9,13 +10,37 @@ import functools
 import operator
 import struct
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
+from skinware_drivers.serial.agni_devices import Name
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_pads
 
 _DEVICE, _TYPE = 7, 0x0203
+_WORDS, _FLOATS, _GLOVE = ("<H", 0), ("<f", 0), ("", 0)
+_SENT: dict[str, tuple[str, int]] = {
+    "undefined": _WORDS,
+    "MID_tactile_fingertip_teensy": _WORDS,
+    "BMP388modified_pressure_array": _WORDS,
+    "BMP388_testboard_4sensors": _WORDS,
+    "tactile_module_16x16_v2": ("", 256),
+    "iobject_myrmex": ("", 960),
+    "tactile_glove_teensy": _GLOVE,
+    "tactile_glove_teensy_bend": _GLOVE,
+    "Generic_position_sensors_float": _FLOATS,
+    "MPU9250": ("<f", 13),
+    "MPU9250_accelerometer": ("<f", 3),
+    "BNO055": ("<h", 13),
+    "BNO08X": ("<f", 10),
+    "BMA255": ("<h", 3),
+    "mpl115a2": ("<f", 1),
+    "AS5013": ("b", 2),
+    "AS5013_y_position": ("b", 1),
+}
+"""Form of a value, empty for others; number of values, 0: the option ``sensors`` gives it."""
+_MYRMEX = ((13, 14, 2, 0), (12, 3, 1, 4), (11, 9, 7, 5), (10, 15, 8, 6))
+"""Converter of each taxel in the first four rows and columns of a quarter of them."""
 _BAD_CHECKSUM, _UNKNOWN, _NO_SUCH_SENSOR = 0xF0, 0xF1, 0xF2
 
 
@@ -25,20 +50,34 @@ def message(number: int, body: bytes) -> bytes:
 
 
 class EmulatedAgniOptions(SerialEmulatorOptions, frozen=True):
-    sensors: Annotated[tuple[int, ...], Meta(description="number of values of each sensor")] = (16, 4)
+    sensors: Annotated[tuple[int, ...], Meta(description="number of values of each sensor, if it may vary")] = (16, 4)
+    devices: Annotated[
+        tuple[Name, ...],
+        Meta(description="the makers' name of each sensor, in order; the last one is also that of all others"),
+    ] = ("undefined",)
 
 
 class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
     """One device, number 1.
 
-    Values: uint16, those of sensor 1, of sensor 2 ... Its time is in microseconds.
+    Values: of sensor 1, of sensor 2 ... as the makers' library shows them. Its time is in microseconds.
     """
 
-    full_scale = 4095
+    full_scale: int | Sequence[int] = 4095
     swing = 3500
 
+    def __init__(self, options: EmulatedAgniOptions, **more: Any) -> None:
+        names = options.devices or ("undefined",)
+        self._names = [names[min(n, len(names) - 1)] for n in range(len(options.sensors))]
+        self._counts = [_SENT[name][1] or n for name, n in zip(self._names, options.sensors, strict=True)]
+        scales = [
+            [127 if _SENT[name][0] == "b" else 4095] * n for name, n in zip(self._names, self._counts, strict=True)
+        ]
+        self.full_scale = [scale for each in scales for scale in each]
+        super().__init__(options, **more)
+
     def places(self) -> Places:
-        return on_pads(*[(count, 4) for count in self.options.sensors])
+        return on_pads(*[(count, 4) for count in self._counts])
 
     def cut(self, heard: bytes) -> tuple[list[bytes], bytes]:
         return cut_packets(heard, b"\xf0\xc4", _total)
@@ -46,8 +85,8 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         uptime_us = (device.sampled_ns - device.ready_ns) // 1000
         stamp, sent, at = struct.pack("<I", uptime_us & 0xFFFF_FFFF), [], 0
-        for number, count in enumerate(self.options.sensors, 1):
-            sent.append(message(number, stamp + struct.pack(f"<{count}H", *values[at : at + count])))
+        for number, (name, count) in enumerate(zip(self._names, self._counts, strict=True), 1):
+            sent.append(message(number, stamp + _payload(name, values[at : at + count], device.cycle)))
             at += count
         return sent
 
@@ -62,7 +101,11 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         if target > len(self.options.sensors) or (target and number != 0xD0):
             return message(0xFE, bytes([_NO_SUCH_SENSOR]))
         if number == 0xC0:
-            each = b"".join(struct.pack("<HH", _TYPE, 2 * count) for count in self.options.sensors)
+            lengths = [
+                len(_payload(name, [0] * count, 0)) for name, count in zip(self._names, self._counts, strict=True)
+            ]
+            kinds = [_TYPE + list(_SENT).index(name) for name in self._names]
+            each = b"".join(struct.pack("<HH", *pair) for pair in zip(kinds, lengths, strict=True))
             return message(0, bytes((1, _DEVICE, len(self.options.sensors))) + each)
         if number == 0xF0:
             return message(0xF0, b"")
@@ -77,6 +120,24 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         else:
             return message(0xFE, bytes([_UNKNOWN]))
         return b""
+
+
+def _payload(name: str, values: Sequence[int], cycle: int) -> bytes:
+    if name == "tactile_module_16x16_v2":
+        words = [0] * 256
+        for taxel, value in enumerate(values):
+            row, column = divmod(taxel, 16)
+            channel = 4 * (row // 4) + column // 4
+            words[16 * _MYRMEX[row % 4][column % 4] + channel] = channel << 12 | value
+        return struct.pack("<256H", *words)
+    if name == "iobject_myrmex":
+        channel = cycle % 16
+        converters = [n for pair in zip(range(30), range(30, 60), strict=True) for n in pair]
+        return struct.pack("<60H", *(channel << 12 | values[16 * n + channel] for n in converters))
+    if name.startswith("tactile_glove"):
+        return b"".join(struct.pack("<BH", number, 4095 - value) for number, value in enumerate(values))
+    form = _SENT[name][0]
+    return b"".join(struct.pack(form, value) for value in values)
 
 
 def _total(command: bytes) -> int:

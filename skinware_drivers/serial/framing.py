@@ -230,6 +230,11 @@ class _Pieces(Framer):
         return [Framed(0, piece, end) for piece, end in zip(pieces, ends, strict=True)], len(stream)
 
 
+def begun(stream: bytes, beginning: bytes) -> int:
+    """Return how many bytes at the end of a stream may be part of the beginning of a frame."""
+    return next((n for n in range(len(beginning) - 1, 0, -1) if stream.endswith(beginning[:n])), 0)
+
+
 def check_body(identifier: int, payload: bytes, field: Field | None, minimum: int, maximum: int) -> None:
     """Refuse a frame that cannot be sent.
 

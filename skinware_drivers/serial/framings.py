@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from skinware.errors import ConfigurationError
-from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, Splitting, check_body
+from skinware_drivers.serial.framing import Field, Framed, Framer, Framing, Splitting, begun, check_body
 
 _MOST_IN_VAIN = 3
 
@@ -155,7 +155,7 @@ class _RecurringFramer(Framer):
                 self.counters.refused += 1
                 self.counters.skipped_bytes += 1
             place += distance or 1
-        kept = next(n for n in range(len(marker) - 1, -1, -1) if stream[place:].endswith(marker[:n]))
+        kept = begun(stream[place:], marker)
         self.counters.skipped_bytes += len(stream) - kept - place
         return found, len(stream) - kept
 

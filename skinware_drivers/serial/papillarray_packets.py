@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from skinware.sensor_types import FORCE, SensorType
 from skinware_drivers.serial.checksums import Sum
-from skinware_drivers.serial.framing import Framed, Framer, ReceivedFraming
+from skinware_drivers.serial.framing import Framed, Framer, ReceivedFraming, begun
 
 _BEGIN, _END = b"\x55\x66\x77\x88", b"\xaa\xbb\xcc\xdd"
 _MOST_BYTES, _MOST_SENSORS, MOST_PILLARS, _LARGEST_POSITION = 4096, 20, 100, 8
@@ -161,7 +161,7 @@ class _PapillArrayFramer(Framer):
                 found += frames
                 done = end + len(_END)
                 counters.frame_bytes += done - at
-        rest = max(done, len(stream) - _begun(stream))
+        rest = max(done, len(stream) - begun(stream, _BEGIN))
         counters.skipped_bytes += rest - done
         return found, rest
 
@@ -181,11 +181,6 @@ class _PapillArrayFramer(Framer):
             news = [Framed(NEWS, np.array(sizes, "<u2").tobytes(), end)]
         taken = parts[self._shape.take]
         return news + [Framed(frame.identifier, frame.body(taken), end) for frame in self._shape.frames]
-
-
-def _begun(stream: bytes) -> int:
-    """Return how many bytes at the end of a stream may begin a packet."""
-    return next(n for n in (3, 2, 1, 0) if stream.endswith(_BEGIN[:n]))
 
 
 class _ShapeReading:

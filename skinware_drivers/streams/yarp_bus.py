@@ -19,6 +19,7 @@ from skinware.status import BusReason
 from skinware.yarp.carriers import READ, Carrier, unframed
 from skinware.yarp.names import DEFAULT_PORT, WHO, NameServer, configured_server, is_port_name
 from skinware_drivers.bus import Bus
+from skinware_drivers.serial.framing import begun
 from skinware_drivers.serial.ports import Port
 from skinware_drivers.serial.stream import CHUNK
 from skinware_drivers.streams.bus import Address, MessagePort, ServerBus, ServerOptions, StreamBus, parse_address
@@ -304,5 +305,5 @@ def _whole_messages(pile: bytes) -> tuple[bytes, bytes]:
     size = message_size(pile, at) if at >= 0 else 0
     if size is None or (at >= 0 and len(pile) < at + size):
         return pile[:at], pile[at:]
-    cut = next((n for n in range(len(BEGIN) - 1, 0, -1) if pile.endswith(BEGIN[:n])), 0)
+    cut = begun(pile, BEGIN)
     return pile[: len(pile) - cut], pile[len(pile) - cut :]

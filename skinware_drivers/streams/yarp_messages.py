@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from skinware_drivers.serial.framing import Framed, Framer, ReceivedFraming
+from skinware_drivers.serial.framing import Framed, Framer, ReceivedFraming, begun
 
 LENGTH, PLAIN, TIMED = 0, 1, 2
 """Kinds of frames."""
@@ -93,7 +93,7 @@ class _Vectors(Framer):
         while True:
             begin = stream.find(BEGIN, done)
             if begin < 0:
-                kept = next((n for n in range(len(BEGIN) - 1, 0, -1) if stream.endswith(BEGIN[:n])), 0)
+                kept = begun(stream, BEGIN)
                 self._skip(max(done, len(stream) - kept) - done)
                 return found, max(done, len(stream) - kept)
             self._skip(begin - done)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import socket
 from collections.abc import Callable
 from dataclasses import asdict
@@ -245,7 +246,7 @@ def _show_port(event: dict[str, Any]) -> None:
         echo(f"{event['port']}: driver {event['driver']}")
 
 
-_RERUN, _FOXGLOVE_PORT = "rerun+http://127.0.0.1:9876/proxy", 8765
+_RERUN, _FOXGLOVE = "rerun+http://127.0.0.1:9876/proxy", "tcp/127.0.0.1:8765"
 _STOP_S, _BACKLOG = 3.0, 128
 """How long the end of a connection is waited for, and the messages that wait for a slow client at most."""
 
@@ -307,20 +308,26 @@ def rerun(
     epilog=cli.examples("skin-bridge foxglove   then, in Foxglove: open a connection to ws://127.0.0.1:8765"),
 )
 @cli.names_argument
-@click.option("--host", default="127.0.0.1", help="Address to listen at; anybody who reaches it sees the skin.")
-@click.option("--port", type=click.IntRange(0, 65535), default=_FOXGLOVE_PORT, help="0: any that is free.")
+@click.option(
+    "--listen",
+    default=_FOXGLOVE,
+    metavar="ENDPOINT",
+    help="Where viewers connect: tcp/HOST:PORT, port 0: any that is free; anybody who reaches it sees the skin.",
+)
 @_rate_option
 @cli.namespace_option
 @cli.json_option
-def foxglove(
-    names: tuple[str, ...], host: str, port: int, rate_hz: float, namespace: str | None, as_json: bool
-) -> None:
+def foxglove(names: tuple[str, ...], listen: str, rate_hz: float, namespace: str | None, as_json: bool) -> None:
     """Show drivers NAME..., or all, also later ones, in Foxglove: point clouds, images and states.
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.conversion.tables import package
 
+    found = re.fullmatch(r"tcp/(.+):(\d{1,5})", listen)
+    if found is None or int(found[2]) >= 1 << 16:
+        raise click.UsageError(f"--listen {listen}: give tcp/HOST:PORT, such as {_FOXGLOVE}")
+    host, port = found[1].strip("[]"), int(found[2])
     foxglove = package("foxglove", "this", extra="foxglove")  # before the sink, which imports it
     from skinware.conversion.live import FoxgloveSink
 
@@ -331,7 +338,7 @@ def foxglove(
             name="skinware", host=host, port=port, context=context, message_backlog_size=_BACKLOG
         )
     except RuntimeError as error:
-        raise click.ClickException(f"{host}, port {port}: {error}") from None
+        raise click.ClickException(f"{listen}: {error}") from None
     where = f"ws://{f'[{host}]' if ':' in host else host}:{server.port}"
     try:
         _run(FoxgloveSink(context), names, rate_hz, namespace, as_json, where)

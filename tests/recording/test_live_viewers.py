@@ -23,7 +23,7 @@ from skinware.errors import NamespaceError
 from skinware.sensor_types import PRESSURE
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, publishing
-from tests.commands import PATIENCE_S, running
+from tests.commands import PATIENCE_S, refused, running
 from tests.streams.peers import LOCAL, free_port
 from tests.views.test_scene import a_hand
 
@@ -100,7 +100,7 @@ def _columns(file: Path) -> dict[str, list[Any]]:
 def test_foxglove_reads_points_and_states() -> None:
     channels: dict[str, Any] = {}
     messages: dict[str, bytes] = {}
-    with publishing(torso()) as skin, running("skin-bridge", "foxglove", "--port", "0") as bridge:
+    with publishing(torso()) as skin, running("skin-bridge", "foxglove", "--listen", "tcp/127.0.0.1:0") as bridge:
         with connect(bridge.wait_for("ready")["to"], subprotocols=[PROTOCOL], max_size=None) as client:
             while "/skin/torso/state" not in channels:
                 told = json.loads(client.recv(PATIENCE_S))
@@ -125,8 +125,14 @@ def test_foxglove_reads_points_and_states() -> None:
     assert json.loads(messages["/skin/torso/state"])["driver"] == "torso"
 
 
+@pytest.mark.parametrize("listen", ["127.0.0.1:8765", "tcp/127.0.0.1", "tcp/127.0.0.1:65536", "tls/127.0.0.1:1"])
+def test_foxglove_says_where_it_can_listen(listen: str) -> None:
+    done = refused("skin-bridge", "foxglove", "--listen", listen)
+    assert (done.returncode, f"--listen {listen}: give tcp/HOST:PORT" in done.stderr) == (2, True)
+
+
 def test_foxglove_ends_beside_clients_that_say_nothing_or_leave_without_a_word() -> None:
-    with publishing(torso()), running("skin-bridge", "foxglove", "--port", "0") as bridge:
+    with publishing(torso()), running("skin-bridge", "foxglove", "--listen", "tcp/127.0.0.1:0") as bridge:
         url = bridge.wait_for("ready")["to"]
         place = (LOCAL, int(url.rpartition(":")[2]))
         with socket.create_connection(place), connect(url, subprotocols=[PROTOCOL], max_size=None) as client:

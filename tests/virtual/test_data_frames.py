@@ -94,14 +94,6 @@ def test_old_firmware_leaves_the_diagnostics_out() -> None:
     assert tail.payload == bytes.fromhex("C0 F0 F0 F0 F0 F0")
 
 
-def test_the_variant_for_tlr_sends_the_second_half_in_class_6() -> None:
-    rig = Rig(boards=(9,), source=constant_source(0xF0), tail_class=6)
-    rig.configure(9)
-    head, tail = rig.run_ms(60)[6:8]
-    assert (head.identifier, head.payload) == (0x493, IDLE_HEAD)
-    assert (tail.identifier, tail.payload) == (0x693, IDLE_TAIL)
-
-
 def test_raw_test_mode_has_no_error_bits() -> None:
     rig = Rig(not_connected=("7/0",), out_of_range=("7/1/4",))
     rig.configure(skin_type=7)

@@ -140,7 +140,6 @@ def test_option_text() -> None:
         ({"out_of_range": ("7/3/12",)}, "taxel 12 in '7/3/12' is outside 0-11"),
         ({"lose": 1.5}, "option lose=1.5"),
         ({"lose": "x"}, "option lose=x"),
-        ({"tail_class": 8}, "option tail_class=8"),
         ({"pattern": "tickle"}, "option pattern=tickle"),
         ({"jitter_us": -1}, "option jitter_us=-1"),
     ],

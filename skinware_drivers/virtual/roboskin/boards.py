@@ -253,13 +253,11 @@ class EmulatedBoard(Device):
 
     def _identifiers(self) -> list[int]:
         """Return the identifiers of the frames of all active triangles: HEAD, TAIL, HEAD ..."""
-        own, tail_class = self.number << 4, self.stage.options.tail_class
-        head = self._data_class << 8 | own
-        tail = head if tail_class == DATA else tail_class << 8 | own
-        key = (head, tail, self._active.tobytes())
+        first = self._data_class << 8 | self.number << 4
+        key = (first, self._active.tobytes())
         if self._identifiers_for[0] != key:
             active = np.flatnonzero(self._active).tolist()
-            self._identifiers_for = key, [half | triangle for triangle in active for half in (head, tail)]
+            self._identifiers_for = key, [first | triangle for triangle in active for _ in ("head", "tail")]
         return self._identifiers_for[1]
 
     # Both kinds of boards obey these commands alike

@@ -70,7 +70,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
     def kind_of(self, identifier: int, payload: bytes) -> str:
         """Name the halves of a triangle by identifier and half: ``0x470-head``; other frames by identifier."""
         name = super().kind_of(identifier, payload)
-        if identifier >> 8 != INERTIAL and identifier >> 8 in (DATA, self.options.tail_class) and payload:
+        if identifier >> 8 == DATA and payload:
             return f"{name}-{'tail' if payload[0] & 0x80 else 'head'}"
         return name
 
@@ -78,9 +78,7 @@ class EmulatedRoboskin(Stage[EmulatedRoboskinOptions]):
         found = []
         for board in self.options.boards:
             for triangle in range(TRIANGLES):
-                low = board << 4 | triangle
-                found.append(self.kind_of(DATA << 8 | low, b"\x40"))
-                found.append(self.kind_of(self.options.tail_class << 8 | low, b"\xc0"))
+                found += [self.kind_of(DATA << 8 | board << 4 | triangle, half) for half in (b"\x40", b"\xc0")]
             found += [self.kind_of(INERTIAL << 8 | board << 4 | sensor, b"") for sensor in (0, 1, 3)]
         return found
 

@@ -38,10 +38,6 @@ class EmulatedRoboskinOptions(EmulatorOptions, frozen=True):
     short_tail: Annotated[
         bool, Meta(description="old firmware: the second frame of a triangle has 6 bytes and no diagnostics")
     ] = False
-    tail_class: Annotated[
-        int,
-        Meta(ge=0, le=7, description="message class of the second frame; 6 in the firmware variant for TLR"),
-    ] = 4
 
     not_connected: Annotated[
         tuple[str, ...], Meta(description="triangles that were never plugged in, as BOARD/TRIANGLE")

@@ -138,7 +138,7 @@ class ViewServer:
 
     def _come_again(self) -> None:
         """Follow once it is worth it: when a turn is due, and before a ring has lost what a plot wants."""
-        pause_s = _LONGEST_S if self._viewers else _TICK_S
+        pause_s = _LONGEST_S
         for viewer in self._viewers:
             pause_s = min(pause_s, viewer.show.follower.slack_s / 2)
             if viewer.wanted:

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
-from contextlib import ExitStack
+import time
+from contextlib import ExitStack, closing
+from typing import cast
 
 import numpy as np
 import pytest
+from websockets.asyncio.server import ServerConnection
 
 from skinware import Namespace, Status
 from skinware.geometry import Geometry
 from skinware.realtime import now_ns
 from skinware.sensor_types import FORCE
 from skinware.tactile.contacts_service import ContactsWriter
-from skinware.views import history
+from skinware.views import history, looks
+from skinware.views.access import Access
+from skinware.views.following import Follower, Origin
 from skinware.views.quantities import levels_of
 from skinware.views.robot import Robot
-from skinware.views.turns import PROTOCOL
+from skinware.views.server import ViewServer
+from skinware.views.shows import Show
+from skinware.views.turns import PROTOCOL, Viewer
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.tactile.skins import AT_ONCE, triangles
@@ -271,6 +279,39 @@ def test_a_scale_of_its_own_where_the_range_is_not_known(serving: Serve) -> None
         low, high = page.pull_picture(condition=lambda picture: picture["scale"][1] >= 15.0)["scale"]
         assert low <= 5
         assert high >= 15
+
+
+def test_a_snapshot_is_looked_for_when_a_turn_is_due_or_a_ring_would_lose_it(
+    namespace: Namespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At most five times a second without a viewer, in time for each that waits and for rings that go round fast."""
+
+    async def looks_after_s(
+        skin: FakeSkin | None, *, waits: bool = False, is_watched: bool = True
+    ) -> tuple[float, float]:
+        with closing(Follower(Origin(namespace))) as follower:
+            if skin is not None:
+                skin.publish()
+                follower.take(0)
+            server, viewer = ViewServer(follower, Access("127.0.0.1", None)), Viewer(Show(follower))
+            server._viewers = {viewer: cast("ServerConnection", None)} if is_watched else {}
+            viewer.wanted = int(waits)
+            viewer.sent_s = (before_s := time.monotonic())
+            server._come_again()
+            after_s = time.monotonic()
+            due_s = server._timer.when()
+            server._timer.cancel()
+            return due_s - after_s, due_s - before_s
+
+    def is_about(span: tuple[float, float], expected_s: float) -> bool:
+        return span[0] <= expected_s <= span[1]
+
+    assert is_about(asyncio.run(looks_after_s(None, is_watched=False)), 0.2)
+    with FakeSkin("slow") as skin:
+        assert is_about(asyncio.run(looks_after_s(skin)), 0.2)
+        assert is_about(asyncio.run(looks_after_s(skin, waits=True)), 1 / looks.DEFAULT_FPS)
+        monkeypatch.setattr(Follower, "slack_s", 0.064)
+        assert is_about(asyncio.run(looks_after_s(skin)), 0.032)
 
 
 def test_state_has_the_tree_and_what_is_wrong(serving: Serve) -> None:

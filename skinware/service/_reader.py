@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from skinware.errors import Overrun, ServiceTimeout
 from skinware.memory.announcement import ReaderRecord
+from skinware.memory.file_layout import MAX_SLOTS
 from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import ACQUIRED, Sample, SampleT
@@ -18,8 +19,7 @@ from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
 
 _ENDLESS_NS = 1 << 61
-_MOST_WHILE_LATE = 32
-"""Half of the largest ring: what has waited in it is caught up with in a third of each period."""
+_LEAST_MAY_COME = 4
 
 
 class ServiceReader(Taking[SampleT]):
@@ -53,7 +53,7 @@ class ServiceReader(Taking[SampleT]):
     ) -> None:
         super().__init__(name, namespace, timeout_s, announce)
         self.left_out: int = 0
-        self._waiting_then, self._came_since = 0, 0
+        self._waiting_then, self._may_come = 0, MAX_SLOTS
 
     @property
     def missed(self) -> int:
@@ -131,18 +131,21 @@ class ServiceReader(Taking[SampleT]):
     def read_next(self, *, timeout_s: float | None = 5.0) -> SampleT:
         """Return the sample after the last one taken, and the newest at first: a program that was held up catches up.
 
-        If 32 more come before it has, it is too slow: it gets the newest ones, until none waits. ``left_out`` counts
-        those between, as ``missed`` does.
+        If half as many more come before it has (at least 4), it is too slow: it gets the newest ones. Each time that
+        it has none to catch up with, one more may come the next time. ``left_out`` counts what it did not get, as
+        ``missed`` does.
 
         Raises:
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
         """
         before, waiting = self._waiting_then, self.waiting
         if waiting == 0:
-            self._came_since = 0
+            self._may_come = min(self._may_come + 1, MAX_SLOTS)
         elif before > 0:
-            self._came_since += max(0, waiting - before)
-        is_too_slow = waiting > 1 and self._came_since >= _MOST_WHILE_LATE
+            self._may_come = max(0, self._may_come - max(0, waiting - before))
+        elif waiting > 1:
+            self._may_come = min(self._may_come, max(_LEAST_MAY_COME, waiting // 2))
+        is_too_slow = waiting > 1 and self._may_come == 0
         self._waiting_then = 0 if is_too_slow else max(0, waiting - 1)
         if is_too_slow:
             self.left_out += waiting - 1

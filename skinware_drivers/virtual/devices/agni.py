@@ -12,33 +12,14 @@ import struct
 from collections.abc import Sequence
 from typing import Annotated, Any
 
+import numpy as np
 from msgspec import Meta
 
-from skinware_drivers.serial.agni_devices import Name
+from skinware_drivers.serial.agni_devices import DEVICES, AgniDevice, Name
 from skinware_drivers.virtual import Device, Places, SerialEmulator, SerialEmulatorOptions, cut_packets, on_pads
 
 _DEVICE, _TYPE = 7, 0x0203
-_WORDS, _FLOATS, _GLOVE = ("<H", 0), ("<f", 0), ("", 0)
-_SENT: dict[str, tuple[str, int]] = {
-    "undefined": _WORDS,
-    "MID_tactile_fingertip_teensy": _WORDS,
-    "BMP388modified_pressure_array": _WORDS,
-    "BMP388_testboard_4sensors": _WORDS,
-    "tactile_module_16x16_v2": ("", 256),
-    "iobject_myrmex": ("", 960),
-    "tactile_glove_teensy": _GLOVE,
-    "tactile_glove_teensy_bend": _GLOVE,
-    "Generic_position_sensors_float": _FLOATS,
-    "MPU9250": ("<f", 13),
-    "MPU9250_accelerometer": ("<f", 3),
-    "BNO055": ("<h", 13),
-    "BNO08X": ("<f", 10),
-    "BMA255": ("<h", 3),
-    "mpl115a2": ("<f", 1),
-    "AS5013": ("b", 2),
-    "AS5013_y_position": ("b", 1),
-}
-"""Form of a value, empty for others; number of values, 0: the option ``sensors`` gives it."""
+_KNOWN: dict[Name, AgniDevice] = {"undefined": AgniDevice("<u2"), **DEVICES}
 _MYRMEX = ((13, 14, 2, 0), (12, 3, 1, 4), (11, 9, 7, 5), (10, 15, 8, 6))
 """Converter of each taxel in the first four rows and columns of a quarter of them."""
 _BAD_CHECKSUM, _UNKNOWN, _NO_SUCH_SENSOR = 0xF0, 0xF1, 0xF2
@@ -67,12 +48,14 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
     swing = 3500
 
     def __init__(self, options: EmulatedAgniOptions, **more: Any) -> None:
-        names = options.devices or ("undefined",)
-        self._names = [names[min(n, len(names) - 1)] for n in range(len(options.sensors))]
-        self._counts = [_SENT[name][1] or n for name, n in zip(self._names, options.sensors, strict=True)]
-        scales = [
-            [127 if _SENT[name][0] == "b" else 4095] * n for name, n in zip(self._names, self._counts, strict=True)
+        names, sizes = options.devices or ("undefined",), options.sensors or (1,)
+        n_sensors = max(len(options.sensors), len(options.devices))
+        self._names = [names[min(n, len(names) - 1)] for n in range(n_sensors)]
+        known = [_KNOWN[name] for name in self._names]
+        self._counts = [
+            one.count(one.size) if one.is_single else sizes[min(n, len(sizes) - 1)] for n, one in enumerate(known)
         ]
+        scales = [[127 if one.dtype == "<i1" else 4095] * n for one, n in zip(known, self._counts, strict=True)]
         self.full_scale = [scale for each in scales for scale in each]
         super().__init__(options, **more)
 
@@ -92,21 +75,21 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
         """Return ``sensor1`` and so on; other messages are answers."""
-        return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self.options.sensors) else "answer"
+        return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self._counts) else "answer"
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
         target, number = command[2:4]
         if functools.reduce(operator.xor, command):
             return message(0xFE, bytes([_BAD_CHECKSUM]))
-        if target > len(self.options.sensors) or (target and number != 0xD0):
+        if target > len(self._counts) or (target and number != 0xD0):
             return message(0xFE, bytes([_NO_SUCH_SENSOR]))
         if number == 0xC0:
             lengths = [
                 len(_payload(name, [0] * count, 0)) for name, count in zip(self._names, self._counts, strict=True)
             ]
-            kinds = [_TYPE + list(_SENT).index(name) for name in self._names]
+            kinds = [_TYPE + list(_KNOWN).index(name) for name in self._names]
             each = b"".join(struct.pack("<HH", *pair) for pair in zip(kinds, lengths, strict=True))
-            return message(0, bytes((1, _DEVICE, len(self.options.sensors))) + each)
+            return message(0, bytes((1, _DEVICE, len(self._counts))) + each)
         if number == 0xF0:
             return message(0xF0, b"")
         if number == 0x00:
@@ -122,7 +105,7 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
         return b""
 
 
-def _payload(name: str, values: Sequence[int], cycle: int) -> bytes:
+def _payload(name: Name, values: Sequence[int], cycle: int) -> bytes:
     if name == "tactile_module_16x16_v2":
         words = [0] * 256
         for taxel, value in enumerate(values):
@@ -136,8 +119,7 @@ def _payload(name: str, values: Sequence[int], cycle: int) -> bytes:
         return struct.pack("<60H", *(channel << 12 | values[16 * n + channel] for n in converters))
     if name.startswith("tactile_glove"):
         return b"".join(struct.pack("<BH", number, 4095 - value) for number, value in enumerate(values))
-    form = _SENT[name][0]
-    return b"".join(struct.pack(form, value) for value in values)
+    return np.array(values, _KNOWN[name].dtype).tobytes()
 
 
 def _total(command: bytes) -> int:

@@ -306,8 +306,9 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
         for (i = first; i < last; i++)
             a.flag[i] &= a.live[i] & (a.touched[i] ^ 1) & (a.at_end[i] ^ 1) & (a.sagging[i] ^ 1) & (a.bears[i] ^ 1);
         INDEPENDENT
-        for (i = first; i < last; i++) { /* beside a touch, a rise may be its load; falls alone would be noise */
-            a.flag[i] &= (a.settling_s[i] < beside_s) | (fabsf(a.smooth[i]) < rustle_share * a.off[i]);
+        for (i = first; i < last; i++) { /* beside a touch a rise may be its load, also one that is not smoothed yet; falls alone would be noise */
+            const int rustles = (fabsf(a.smooth[i]) < rustle_share * a.off[i]) & (fabsf(a.deviation[i]) < a.off[i]);
+            a.flag[i] &= (a.settling_s[i] < beside_s) | rustles;
         }
         INDEPENDENT
         for (i = first; i < last; i++) {

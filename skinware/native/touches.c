@@ -119,7 +119,8 @@ static int64_t judge(struct baseline *b, double passed_s) {
     return n_over;
 }
 
-/* Ends touches: the rest of the load is what the prediction was wrong by, unless the touch was too light to say so. */
+/* Ends touches: the rest of the load is what the prediction was wrong by, unless the touch was too light to say so. What
+ * is below 0 then needs no higher threshold, under which the next press would be taken for drift. */
 static void let_go(struct baseline *b) {
     int64_t i, k;
     for (k = 0; k < b->n_touched; k++) {
@@ -128,7 +129,7 @@ static void let_go(struct baseline *b) {
         const int is_too_long = b->contact_s[i] > (float)b->maximum_hold_s;
         if (!b->flag[i])
             continue;
-        if (b->peak[i] > 2 * b->on[i])
+        if (b->peak[i] > 2 * b->on[i] && load_of(b, left) > 0)
             b->variance[i] += left * left;
         end_touch(b, i);
         if (is_too_long)

@@ -702,3 +702,16 @@ def test_offsets_are_as_uncertain_as_they_are_wrong_while_taxels_drift_by_themse
     assert np.mean(free) > 0.93
     assert np.mean(held) > 0.85
     assert np.mean(np.square(doubts)) < 4 * np.mean(np.square(errors))
+
+
+def test_load_beside_a_touch_moves_no_uncertain_offset() -> None:
+    bench = Bench(noise=4)
+    bench.run(6)
+    bench.run(1, on(0, load=400))
+    state = bench.baseline.state()
+    state["variance"][5] = 900
+    bench.baseline.restore(state, np.arange(N))
+    bench.run(1, on(0, load=400) + on(5, load=-40))
+    for load in range(-40, 100, 5):
+        bench.run(0.02, on(0, load=400) + on(5, load=load))
+    assert abs(bench.calm.baseline[5] - 15) < 12

@@ -262,7 +262,8 @@ class SpecifiedBaseline:
                 settled |= touches.smooth < -off  # no touch leaves less than 0
             learns = live & ~touches.touched & ~self._falls.sagging & settled
             learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
-            learns &= ~self._surroundings.beside | (np.abs(touches.smooth) < rustle)
+            rustles = (np.abs(touches.smooth) < rustle) & (np.abs(deviation) < off)
+            learns &= ~self._surroundings.beside | rustles
             calm = learns & (np.abs(touches.smooth) < rustle)
             offsets.learn(deviation, learns, calm, touches.remainders.used <= 0, live, floor, passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
@@ -355,6 +356,7 @@ class SpecifiedBaseline:
             left, now = touches.smooth[over], deviation[over]
             left = np.where(np.abs(now) < np.abs(left), now, left)  # the smoothed one may still fall
             firm = touches.peak[over] > 2 * on[over]  # a light one that flickers says nothing of its offset
+            firm &= touches.load(left) > 0  # no rest below 0 begins a touch
             offsets.variance[over] += left * left * firm
             too_long = touches.contact_s[over] > (self._settings.maximum_hold_s or math.inf)
             touches.end(over)

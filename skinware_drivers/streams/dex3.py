@@ -205,7 +205,7 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
                             *taxels(_TAXELS, "temperature", first_uid=hand << 8 | pad << 4),
                         ],
                         key=pad,
-                        kind="3x4" if name in _PALM else "4x3",
+                        kind="4x3",
                         name=name,
                     )
                     for pad, name in enumerate(of_hand)

@@ -79,12 +79,14 @@ class ServiceReader(Taking[SampleT]):
 
     @property
     def waiting(self) -> int:
-        """Number of samples of the generation at hand that are newer than the last one that was taken."""
+        """Samples of the generation at hand after the last one taken; before the first one, only the newest counts."""
         ring, last = self._ring, self._last_taken
-        taken: int = 0 if last is None or last[0] != ring.generation else last[1]
         if self._turns_in_c:
-            taken = ring.state_in_c.last
-        return ring.latest - taken
+            taken: int = ring.state_in_c.last
+            return ring.latest - taken
+        if last is None:
+            return min(ring.latest, 1)
+        return ring.latest - (last[1] if last[0] == ring.generation else 0)
 
     def refresh(self) -> Position | None:
         """Go over to a newer generation if there is one; position of the newest sample then.

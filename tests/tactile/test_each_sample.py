@@ -96,6 +96,18 @@ def test_samples_of_a_hold_up_are_read_in_order() -> None:
         assert missed(source) == 0
 
 
+def test_what_came_before_the_first_sample_was_not_waiting() -> None:
+    hand = Hand()
+    with hand.writer, closing(DriverSource("hand", Namespace())) as source:
+        hand.publish(5)
+        assert source.next_frame() is None
+        frame = source.next_frame()
+        assert frame is not None
+        assert frame.sequence == 5
+        hand.publish(40)
+        assert take(source) == list(range(6, 46))
+
+
 def test_what_the_ring_has_no_more_is_missed_and_the_rest_read() -> None:
     hand = Hand(slots=8)
     with hand.writer, following(hand) as source:

@@ -143,9 +143,9 @@ static bool take_packet(
 /* -- frames of one length without a checksum ------------------------------------------------------------------------
  *
  * Only marks are known of them: the trailer of one, the beginning of the next. Values can look like a mark, too, even
- * in frame after frame, at the same offset. So a step, once found, is kept over damaged marks; it is left for another
- * offset whose marks go on where its own end; and after lost bytes, the step is found at which the known false marks
- * are where they were. */
+ * in frame after frame, at the same offset. Where such false marks are known, a step is kept over damaged marks; it is
+ * left for another offset whose marks go on where its own end; and after lost bytes, the step is found at which the
+ * known false marks are where they were. */
 
 enum {
     MISSES = 4,    /* a step is kept if one of so many marks is in place */
@@ -234,6 +234,8 @@ static bool has_slipped(const struct framing *framing, const struct stream *stre
 static int64_t next_step(const struct framing *framing, struct stream *stream)
 {
     int64_t total = framing->longest;
+    if (!stream->n_false_marks)
+        return 0;
     for (int64_t i = 2; i <= MISSES; i++) {
         if (stream->size - stream->place < i * total + framing->n_sync)
             return -1;

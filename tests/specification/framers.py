@@ -193,6 +193,8 @@ class PacketFramer(Framer):
     def _next_step(self, stream: bytes, place: int) -> int:
         """Return how far the next frame in step is; 0: the step is lost, -1: more bytes must come."""
         total = self._framing.longest
+        if not self._known:
+            return 0
         for n in range(2, _MISSES + 1):
             if len(stream) - place < n * total + len(self._framing.sync):
                 return -1

@@ -183,6 +183,7 @@ class Packet(CompiledFraming):
 
     @property
     def undecided(self) -> int:
+        """Bytes that must have come to decide whether a frame begins, at most."""
         if self.confirmed:
             return _LENGTHS_COMPARED * self.longest + len(self.sync)
         return max(self.longest, self.known_from)

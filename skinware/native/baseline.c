@@ -27,7 +27,7 @@ void skinware_baseline_begin(struct baseline *b) {
     for (i = 0; i < b->n_patches; i++)
         b->patches[i].since_s = INFINITY;
     for (i = 0; i < b->n_modules; i++)
-        b->modules[i].old_s = INFINITY;
+        b->modules[i].old_s = b->modules[i].begun_s = INFINITY;
 }
 
 double least_on(const struct baseline *b) {

@@ -106,6 +106,7 @@ struct patch {
 
 struct module {
     double old_s;   /* how long ago it was touched by a touch that is not new */
+    double begun_s; /* how long ago the newest touch began on it */
     double touched; /* number of its taxels */
     double near;    /* 1: something touches it */
     double looked;  /* a touch on it is looked at: touches.c has when */

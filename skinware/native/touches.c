@@ -51,11 +51,13 @@ static void end_learning(struct baseline *b, float weight) {
     }
 }
 
-/* Returns whether the rest after a sudden fall faded by itself: then it was no load. */
+/* Returns whether the rest after a sudden fall faded by itself: then it was no load. Where a touch began on the module since
+ * the fall, the load may have moved there. */
 static int fades(struct baseline *b, int64_t i, float load, float passed, float follows) {
     const float off = b->off[i], before = b->steady[i], noted = b->noted[i];
     const int fell = load < FALLEN * before && before > 2 * off, moved = fell || fabsf(load - before) > off;
     const float steady = fell ? load : before + (load - before) * follows;
+    const double begun_s = b->modules[b->module[i]].begun_s;
     const float since = (fell ? 0.0f : moved && isfinite(noted) ? INFINITY : b->since_fall_s[i]) + passed;
     float left = moved ? NAN : noted;
     if (isnan(left) && since >= LEFT_AT_S && since < 2 * LEFT_AT_S) {
@@ -64,7 +66,7 @@ static int fades(struct baseline *b, int64_t i, float load, float passed, float 
     }
     b->steady[i] = steady, b->noted[i] = left, b->since_fall_s[i] = since;
     return isfinite(left) && steady < lowest(FADED * left, left - 0.5f * off) &&
-           left < MOST_REMAINDER * b->used_then[i] && since < 2 * (float)USED_S;
+           left < MOST_REMAINDER * b->used_then[i] && since < 2 * (float)USED_S && begun_s >= (double)since;
 }
 
 static void begin_touch(struct baseline *b, int64_t i, float load) {
@@ -73,6 +75,7 @@ static void begin_touch(struct baseline *b, int64_t i, float load) {
     b->since_fall_s[i] = INFINITY;
     b->noted[i] = NAN;
     b->contact_s[i] = 0;
+    b->modules[b->module[i]].begun_s = 0;
 }
 
 /* Finds touches and their ends; b->flag says which are over, b->list which there are. */
@@ -83,6 +86,8 @@ static int64_t judge(struct baseline *b, double passed_s) {
     const float eases = (float)passed_share(passed_s, USED_S); /* what falls more slowly was not let go */
     int64_t i, k, n_over = 0;
     b->n_touched = 0;
+    for (k = 0; k < b->n_modules; k++)
+        b->modules[k].begun_s += passed_s;
     for (i = 0; i < b->n; i++) {
         const int high = (load_of(&a, a.deviation[i]) > a.off[i]) & a.live[i], was_high = a.high[i];
         a.high[i] = a.live[i] ? (uint8_t)high : a.high[i];

@@ -715,3 +715,14 @@ def test_load_beside_a_touch_moves_no_uncertain_offset() -> None:
     for load in range(-40, 100, 5):
         bench.run(0.02, on(0, load=400) + on(5, load=load))
     assert abs(bench.calm.baseline[5] - 15) < 12
+
+
+def test_load_that_moves_to_other_taxels_as_a_grip_loosens_is_no_remainder() -> None:
+    bench = Bench()
+    bench.run(6)
+    bench.run(60, on(0, 1, 2, load=400))
+    bench.run(1, on(0, 1, 2, load=90))
+    for moved in np.linspace(0, 50, 50 * RATE_HZ):
+        bench.run(1 / RATE_HZ, on(0, 1, 2, load=90 - moved) + on(3, 4, load=moved))
+    assert bench.calm.touched[:5].all()
+    assert np.abs(bench.calm.baseline[:5] - 15).max() < 3

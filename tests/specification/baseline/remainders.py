@@ -28,6 +28,7 @@ class Remainders:
         left: (n,) float32, what is left of loads that are over.
         share: (n_patches,) float32, share of a load that a cover keeps.
         since_end_s: (n,) float32, how long each has been free of touches.
+        begun_s: (n_modules,) how long ago the newest touch began on each module.
     """
 
     def __init__(self, modules: Grouping, patch: Rows) -> None:
@@ -38,6 +39,7 @@ class Remainders:
         self._noted: Floats = np.full(n, np.nan, np.float32)
         """How much was left some seconds after a fall."""
         self.since_end_s: Floats = np.full(n, np.inf, np.float32)
+        self.begun_s: npt.NDArray[np.float64] = np.full(modules.n, np.inf)
         self.any_used = False
         self.share: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
 
@@ -52,6 +54,7 @@ class Remainders:
         self._steady[taxels] = load
         self._since_fall_s[taxels] = np.inf
         self._noted[taxels] = np.nan
+        self.begun_s[self._modules.group[taxels]] = 0
 
     def forget(self, taxels: Rows) -> None:
         """Drop what is known of some taxels."""
@@ -75,6 +78,7 @@ class Remainders:
         self._since_fall_s[active], self._used_then[active] = since, then
         faded: Flags = (steady < np.minimum(FADED * left, left - 0.5 * off)) & (left < MOST_REMAINDER * then)
         faded &= since < 2 * USED_S
+        faded &= self.begun_s[self._modules.group[active]] >= since  # else the load may have moved to that touch
         if faded.any():
             self._learn(active[faded], left[faded], then[faded], 1.0)
         return faded

@@ -86,6 +86,7 @@ class Touches:
         Returns:
             The taxels whose touch is over.
         """
+        self.remainders.begun_s += passed_s
         smooth, now = self.load(self.smooth), self.load(deviation)
         high = (now > off) & live
         begins = high & (smooth > on) & ~self.touched

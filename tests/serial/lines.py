@@ -139,7 +139,7 @@ class Device(threading.Thread):
     def __init__(self, where: Line, name: str = "tip1", flood: bytes = b"") -> None:
         super().__init__(daemon=True)
         self._line = where
-        self._name = b"I am " + name.encode()
+        self._says = b"I am " + name.encode()
         self._flood = flood
         self._ending = threading.Event()
         self.value = 0
@@ -152,7 +152,7 @@ class Device(threading.Thread):
                     heard += os.read(self._line.master, 4096)
                 if FRAMING.encode(ASK, b"who") in heard:
                     heard = b""
-                    os.write(self._line.master, FRAMING.encode(ANSWER, self._name))
+                    os.write(self._line.master, FRAMING.encode(ANSWER, self._says))
                 self.value += 1
                 os.write(self._line.master, self._flood or data_frame(self.value & 0xFFFF))
             except BlockingIOError:

@@ -85,7 +85,8 @@ class AgniDriver(SerialAdapter[AgniOptions]):
         self._n_sensors = 0
         undefined = AgniDevice(options.values, size=np.dtype(options.values).itemsize)
         self._devices = {"undefined": undefined, **DEVICES}
-        known = [self._devices[name] for name in options.devices or ("undefined",)]
+        self._names: Sequence[Name] = options.devices or ("undefined",)
+        known = [self._devices[name] for name in self._names]
         self.types = list(dict.fromkeys(kind for device in known for kind in device.types))
         dtypes = [np.dtype(device.dtype).newbyteorder("=") for device in known]
         self.dtype = np.dtype(np.float32)
@@ -132,8 +133,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
 
     def _name(self, number: int) -> Name:
         """Return the makers' name of sensor ``number``, from 1 on."""
-        names = self.options.devices or ("undefined",)
-        return names[min(number, len(names)) - 1]
+        return self._names[min(number, len(self._names)) - 1]
 
     def _wanted(self, name: Name) -> str:
         if name == "undefined":

@@ -65,11 +65,10 @@ _BEGINNINGS = {"full": "rt/dex3", "low": "rt/lf/dex3"}
 
 _MOTORS, _TAXELS, _MOST_PADS = 7, 12, 16
 _FINGERS = ("thumb pad", "thumb tip", "middle pad", "middle tip", "index pad", "index tip")
-_PALM = ("palm middle", "palm centre", "palm index")
-"""The pads of the palm, by the finger that is nearest."""
-_PADS_OF = {"left": (*_FINGERS, *reversed(_PALM)), "right": (*_FINGERS, *_PALM)}
-_FROM_END_M = {"tip": 0.018, "pad": 0.059}
 _ASIDE_M = {"palm middle": -0.026, "palm centre": 0.0, "palm index": 0.026}
+"""The pads of the palm, by the finger that is nearest."""
+_PADS_OF = {"left": (*_FINGERS, *reversed(_ASIDE_M)), "right": (*_FINGERS, *_ASIDE_M)}
+_FROM_END_M = {"tip": 0.018, "pad": 0.059}
 _BELOW_FINGERS_M = 0.0105
 _ON_FINGER, _ON_PALM = Grid(4, 3, 0.004), Grid(3, 4, 0.004)
 _CELLS = np.arange(_TAXELS)

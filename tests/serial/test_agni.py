@@ -114,7 +114,7 @@ SOURCE: dict[str, tuple[str, list[float]]] = {
 
 
 def decoded(name: str, payloads: Sequence[bytes]) -> Shown:
-    """What the driver shows of a device with one sensor that sends these payloads."""
+    """Return the values that the driver shows of a device with one sensor that sends these payloads."""
     driver = AgniDriver(AgniOptions(devices=(name,)))  # type: ignore[arg-type]
 
     class Described(EmulatedAgni):

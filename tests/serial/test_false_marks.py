@@ -72,7 +72,7 @@ def damaged(
 
 
 def shown(framing: Framing, stream: bytes, rng: np.random.Generator) -> list[bytes]:
-    """What is found, by C and by its specification, however the stream is cut."""
+    """Return the bodies that C and its specification find, however the stream is cut."""
     found, _, _ = outcome(framing, cut(stream, rng.integers(0, len(stream), 30).tolist()))
     return [frame.body for frame in found]
 

@@ -68,7 +68,7 @@ class Hand:
 
 @contextmanager
 def following(hand: Hand) -> Iterator[DriverSource]:
-    """What reads a driver, and has its first sample."""
+    """Read a driver, whose first sample is taken."""
     with closing(DriverSource("hand", Namespace())) as source:
         hand.publish(1)
         assert take(source) == [1]

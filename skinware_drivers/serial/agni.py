@@ -30,7 +30,7 @@ from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor
 from skinware_drivers.fields import DeviceTime
 from skinware_drivers.layout import Layout
 from skinware_drivers.serial import XOR, Field, LengthTable, Packet, SerialAdapter, Unframed
-from skinware_drivers.serial.agni_devices import DEVICES, TIME, AgniDevice, Name, frames_of
+from skinware_drivers.serial.agni_devices import DEVICES, TIME, AgniDevice, Name
 
 _BEGIN = b"\xf0\xc4"
 _IN_A_MS = 10
@@ -121,7 +121,7 @@ class AgniDriver(SerialAdapter[AgniOptions]):
             names = [of_value.name for of_value in known.types] * (count // len(known.types))
             channels = [Sensor(what, first_uid + n) for n, what in enumerate(names)]
             modules.append(Module(channels, number, f"type {kind}", "" if name == "undefined" else name))
-            frames += frames_of(name, known, number, length, time, self.period_s)
+            frames += known.frames(number, length, time, self.period_s)
             first_uid += count
         link.log.info("device %d with %d sensors", device, n_sensors)
         self.layout = Layout(frames)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from skinware.sensor_types import ACCELERATION, ANGULAR_RATE, MAGNETIC_FIELD, PRESSURE, SensorType
 from skinware.status import Status
-from skinware_drivers.fields import Byte, DeviceTime, Identifier, Sentinel
+from skinware_drivers.fields import Byte, Condition, DeviceTime, Identifier, Sentinel
 from skinware_drivers.layout import Expand, Frame, Values
 
 TIME = 4
@@ -31,7 +31,6 @@ _CONVERTERS = np.array(((13, 14, 2, 0), (12, 3, 1, 4), (11, 9, 7, 5), (10, 15, 8
 _ROW, _COLUMN = np.divmod(np.arange(256), 16)
 _MYRMEX_WORDS = 16 * _CONVERTERS[_ROW % 4, _COLUMN % 4] + 4 * (_ROW // 4) + _COLUMN // 4
 _CHANNELS, _CONVERTERS_OF_A_BLOCK = 16, 30
-_NO_MEASUREMENT = -0x5A5B
 
 Bytes = npt.NDArray[np.uint8]
 Found = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[Any]]
@@ -102,6 +101,19 @@ def _read_iobject(payload: Bytes, _: Bytes, channel: int) -> Found:
     return _found(_taxels_of(channel), words & 0x0FFF)
 
 
+Part = tuple[int | None, Values | Expand]
+"""The channel that a message has, if each has one of several; and how it is read."""
+
+
+def _iobject_parts(_: int) -> list[Part]:
+    channels = range(_CHANNELS)
+    return [(one, Expand(partial(_read_iobject, channel=one), _taxels_of(one).tolist())) for one in channels]
+
+
+def _glove_parts(length: int) -> list[Part]:
+    return [(None, Expand(partial(_read_glove, length=length)))]
+
+
 class AgniDevice(NamedTuple):
     """A sensor of the library.
 
@@ -111,6 +123,8 @@ class AgniDevice(NamedTuple):
         size: bytes of an item.
         is_single: there is one item, and what follows is left out; else there are as many as fit.
         each: channels that an item becomes, if not one for each type.
+        none: the value that is no measurement; None: all are.
+        parts: returns how payloads of so many bytes are read; None: their values follow each other.
     """
 
     dtype: str
@@ -118,27 +132,54 @@ class AgniDevice(NamedTuple):
     size: int = 2
     is_single: bool = False
     each: int = 0
+    none: int | None = None
+    parts: Callable[[int], Sequence[Part]] | None = None
 
     def count(self, length: int) -> int:
         """Return the number of values of a payload; 0: it is no payload of this sensor."""
         items = int(length >= self.size) if self.is_single else 0 if length % self.size else length // self.size
         return items * (self.each or len(self.types))
 
+    def frames(self, number: int, length: int, time: DeviceTime | None, period_s: float) -> list[Frame]:
+        """Return the frames of sensor ``number`` (from 1), which sends ``length`` bytes every ``period_s``."""
+        parts = self.parts(length) if self.parts else [(None, Values(TIME, self.dtype, self.count(length)))]
+        flags = [] if self.none is None else [Sentinel(Status.SUSPECT, self.none)]
+        found = []
+        for channel, values in parts:
+            when: list[Condition] = [Identifier(number)]
+            if channel is not None:
+                when.append(Byte(TIME + 1, channel << 4, 0xF0))
+            found.append(
+                Frame(
+                    f"sensor {number}" if channel is None else f"sensor {number} channel {channel}",
+                    when,
+                    [TIME + length],
+                    values,
+                    module=number,
+                    flags=flags,
+                    time=time,
+                    period_s=None if channel is None else len(parts) * period_s,
+                )
+            )
+        return found
+
 
 _INERTIAL = AgniDevice("<f4", (*_ACCELERATION, *_RATE, *_FIELD, *_ORIENTATION), 52, is_single=True)
-_GLOVE = AgniDevice("<u2", TAXEL, 3)
+_GLOVE = AgniDevice("<u2", TAXEL, 3, parts=_glove_parts)
 DEVICES: dict[Name, AgniDevice] = {
     "MID_tactile_fingertip_teensy": AgniDevice("<u2"),
     "BMP388modified_pressure_array": AgniDevice("<i2"),
     "BMP388_testboard_4sensors": AgniDevice("<i2"),
-    "tactile_module_16x16_v2": AgniDevice("<u2", TAXEL, 512, is_single=True, each=256),
-    "iobject_myrmex": AgniDevice("<u2", TAXEL, 120, is_single=True, each=960),
+    "tactile_module_16x16_v2": AgniDevice(
+        "<u2", TAXEL, 512, is_single=True, each=256, parts=lambda _: [(None, Expand(_read_myrmex))]
+    ),
+    "iobject_myrmex": AgniDevice("<u2", TAXEL, 120, is_single=True, each=960, parts=_iobject_parts),
     "tactile_glove_teensy": _GLOVE,
     "tactile_glove_teensy_bend": _GLOVE._replace(types=_POSITION),
     "Generic_position_sensors_float": AgniDevice("<f4", _POSITION, 4),
     "MPU9250": _INERTIAL,
     "MPU9250_accelerometer": AgniDevice("<f4", _ACCELERATION, 12, is_single=True),
-    "BNO055": AgniDevice("<i2", (*_ORIENTATION, *_ACCELERATION, *_FIELD, *_RATE), 26, is_single=True),
+    "BNO055": AgniDevice("<i2", (*_ORIENTATION, *_ACCELERATION, *_FIELD, *_RATE), 26, is_single=True, none=-0x5A5B),
     "BNO08X": AgniDevice("<f4", (*_ACCELERATION, *_RATE, *_ORIENTATION), 40, is_single=True),
     "BMA255": AgniDevice("<i2", _ACCELERATION, 6, is_single=True),
     "mpl115a2": AgniDevice("<f4", _AIR, 4, is_single=True),
@@ -146,36 +187,3 @@ DEVICES: dict[Name, AgniDevice] = {
     "AS5013_y_position": AgniDevice("<i1", _STICK[1:], 1, is_single=True),
 }
 """By the names of the library; for ``undefined``, options say what it sends."""
-
-
-def frames_of(
-    name: Name, device: AgniDevice, number: int, length: int, time: DeviceTime | None, period_s: float
-) -> list[Frame]:
-    """Return the frames of sensor ``number`` (from 1), which sends ``length`` bytes every ``period_s``."""
-
-    def frame(values: Values | Expand, channel: int | None = None) -> Frame:
-        is_part = channel is not None
-        return Frame(
-            f"sensor {number}" + (f" channel {channel}" if is_part else ""),
-            [Identifier(number), *([Byte(TIME + 1, channel << 4, 0xF0)] if channel is not None else [])],
-            [TIME + length],
-            values,
-            module=number,
-            flags=[Sentinel(Status.SUSPECT, _NO_MEASUREMENT)] if name == "BNO055" else [],
-            time=time,
-            period_s=_CHANNELS * period_s if is_part else None,
-        )
-
-    if name == "iobject_myrmex":
-        return [
-            frame(Expand(partial(_read_iobject, channel=channel), _taxels_of(channel).tolist()), channel)
-            for channel in range(_CHANNELS)
-        ]
-    reading: dict[Name, Callable[..., Found]] = {
-        "tactile_module_16x16_v2": _read_myrmex,
-        "tactile_glove_teensy": partial(_read_glove, length=length),
-        "tactile_glove_teensy_bend": partial(_read_glove, length=length),
-    }
-    if name in reading:
-        return [frame(Expand(reading[name]))]
-    return [frame(Values(TIME, device.dtype, device.count(length)))]

@@ -212,6 +212,9 @@ static measured result_of(const struct baseline *b, int64_t taxel, float typical
 
 static void begin(struct baseline *b, int64_t taxel, const measured *found) {
     const float noise2 = highest(found->noise2, least_noise2(b, found->level));
+    int64_t block;
+    for (block = 0; block < BLOCKS; block++)
+        block_at(b, block)[COUNT * b->n + taxel] = 0; /* else it would begin again while others wait */
     b->level[taxel] = found->level;
     b->noise2[taxel] = noise2;
     b->gain[taxel] = b->gain_before[taxel] = lowest(highest(found->gain, LEAST_GAIN), MOST_GAIN);

@@ -594,19 +594,6 @@ def test_a_light_load_beside_a_touch_is_not_learned_after_a_short_rest() -> None
     assert calm.touched[5]
 
 
-@pytest.mark.parametrize("dead", [0, 10])
-def test_without_noise_a_taxel_says_no_more_of_the_drift_that_all_have_in_common(dead: int) -> None:
-    """Values of 24 bits, whose noise is small beside their drift; dead taxels have none at all."""
-    random = np.random.default_rng(1)
-    gain = 1 + 0.25 * random.standard_normal(N)
-    baseline = Baseline(MODULE, np.zeros(N, int))
-    for number in range(60 * 20):
-        values = 2.5e6 + 100 * number * gain + 6e3 * random.standard_normal(N)
-        values[:dead] = 2.5e6
-        calm = baseline.update(number * NS_PER_S // 20, values)
-        assert not calm.touched[dead:].any(), f"{number / 20} s"
-
-
 def test_a_hand_in_use_from_the_first_frame_takes_no_press_for_noise() -> None:
     """A quarter of the taxels are pressed for 0.4 s of each 1.1 s: they wait until they are known at rest."""
     random, n = np.random.default_rng(4), 40

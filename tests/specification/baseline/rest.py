@@ -106,6 +106,8 @@ class Rest:
         refused = int(moving.sum()) > max(1, MOVED_SHARE * measured.sum())
         self.refused_share = int(moving.sum()) / int(seen.sum()) if refused else 0.0
         begins = measured & ~moving if refused else measured
+        for block in self._blocks:
+            block[0, taxels[begins]] = 0  # else they would begin again while others wait
         if not refused:
             self._clear()  # a taxel that sends later starts a new one
         return Measured(found.taxels[begins], *(array[begins] for array in found[1:]))

@@ -21,8 +21,8 @@ from serial.tools import list_ports
 
 import skinware.recording
 from skinware import DriverReader, Namespace, Sample, ServiceReader, ServiceWriter, errors, native
-from skinware.bridge import Link as BridgeLink
-from skinware.bridge import endpoints
+from skinware.bridge.endpoints import endpoints
+from skinware.bridge.link import Link as BridgeLink
 from skinware.errors import SkinwareError
 from skinware.memory.ring import slot_headers_of
 from skinware.realtime import Profile

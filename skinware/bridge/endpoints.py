@@ -140,17 +140,23 @@ def endpoints(
     return Endpoints(places, [_checked(text, protocol) for text in connect], mode, security)
 
 
-def _checked(text: str, protocol: str | None) -> str:
+def split_endpoint(text: str, least_port: int = 1) -> tuple[str, str, int]:
+    """Return protocol, host and port of ``tcp/HOST:PORT`` or ``tls/HOST:PORT``; ConfigurationError: it is neither."""
     found = _ENDPOINT.fullmatch(text)
-    if not found or not 0 < int(found[3]) < 65536:
+    if not found or not least_port <= int(found[3]) < 65536:
         raise ConfigurationError(f"{text!r} is no endpoint: give tcp/HOST:PORT, as in tcp/192.168.1.10:7448")
-    if found[1] == "tls" and protocol is None:
+    return found[1], found[2].strip("[]"), int(found[3])
+
+
+def _checked(text: str, protocol: str | None) -> str:
+    own = split_endpoint(text)[0]
+    if own == "tls" and protocol is None:
         raise ConfigurationError(f"{text}: give --tls DIR with the certificates")
-    return f"{protocol or found[1]}/{found[2]}:{found[3]}"
+    return f"{protocol or own}/{text.partition('/')[2]}"
 
 
 def _is_on_this_machine(endpoint: str) -> bool:
-    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    host = split_endpoint(endpoint)[1]
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -187,10 +193,9 @@ def why_unreachable(endpoint: str, tls: Path | None) -> str:
     Returns:
         The reason why it fails, in one line; empty if it succeeds.
     """
-    host, _, port = endpoint.partition("/")[2].rpartition(":")
-    host = host.strip("[]")
+    _, host, port = split_endpoint(endpoint)
     try:
-        connection = socket.create_connection((host, int(port)), _CONNECT_S)
+        connection = socket.create_connection((host, port), _CONNECT_S)
     except ConnectionRefusedError:
         return f"{endpoint}: nothing listens there; is skin-bridge serve running, with this --listen?"
     except TimeoutError:

@@ -10,12 +10,16 @@ import resource
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
-import zenoh
-
 from skinware.bridge.endpoints import Endpoints
-from skinware.errors import BridgeError, SkinwareError
+from skinware.errors import BridgeError, MissingExtra, SkinwareError
+
+if find_spec("zenoh") is None:
+    raise MissingExtra.of("bridges", "skinware[zenoh]")
+
+import zenoh
 
 _LEASE_MS, _SIGNS_OF_LIFE = 5000, 10
 """A session without a byte for this long is over; how often a session shows in that time that it lives. The first sign

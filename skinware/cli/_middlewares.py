@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import re
 import socket
 from collections.abc import Callable
 from dataclasses import asdict
@@ -322,12 +321,12 @@ def foxglove(names: tuple[str, ...], listen: str, rate_hz: float, namespace: str
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
+    from skinware.bridge.endpoints import split_endpoint
     from skinware.conversion.tables import package
 
-    found = re.fullmatch(r"tcp/(.+):(\d{1,5})", listen)
-    if found is None or int(found[2]) >= 1 << 16:
-        raise click.UsageError(f"--listen {listen}: give tcp/HOST:PORT, such as {_FOXGLOVE}")
-    host, port = found[1].strip("[]"), int(found[2])
+    protocol, host, port = split_endpoint(listen, least_port=0)
+    if protocol != "tcp":
+        raise ConfigurationError(f"{listen!r}: viewers connect without TLS: give tcp/HOST:PORT")
     foxglove = package("foxglove", "this", extra="foxglove")  # before the sink, which imports it
     from skinware.conversion.live import FoxgloveSink
 

@@ -80,7 +80,9 @@ def route(
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
-    from skinware.bridge import DEFAULT_ROUTER, Link, Rules, Watcher, endpoints
+    from skinware.bridge.endpoints import DEFAULT_ROUTER, Rules, endpoints
+    from skinware.bridge.link import Link
+    from skinware.bridge.watching import Watcher
 
     places = endpoints(
         listen=listen or (DEFAULT_ROUTER,),
@@ -127,8 +129,9 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
 
     Exit status: 0 done or interrupted, 1 no robot reached, 2 wrong usage.
     """
-    from skinware.bridge import Link, Watcher, endpoints
-    from skinware.bridge.endpoints import why_unreachable
+    from skinware.bridge.endpoints import endpoints, why_unreachable
+    from skinware.bridge.link import Link
+    from skinware.bridge.watching import Watcher
 
     places = endpoints(connect=connect, tls=tls)
     with contextlib.closing(Link(places)) as link:

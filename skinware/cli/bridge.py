@@ -77,8 +77,10 @@ def serve(
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
-    from skinware.bridge import DEFAULT_LISTEN, Link, Rules, Server, endpoints
+    from skinware.bridge.endpoints import DEFAULT_LISTEN, Rules, endpoints
+    from skinware.bridge.link import Link
     from skinware.bridge.messages import Keys
+    from skinware.bridge.serving import Server
     from skinware.memory.namespace import Namespace, check_name
 
     for name in names:
@@ -155,9 +157,10 @@ def join(
 
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
-    from skinware.bridge import Joiner, Link, Wish, endpoints
-    from skinware.bridge.endpoints import why_unreachable
-    from skinware.bridge.messages import Keys
+    from skinware.bridge.endpoints import endpoints, why_unreachable
+    from skinware.bridge.joining import Joiner
+    from skinware.bridge.link import Link
+    from skinware.bridge.messages import Keys, Wish
     from skinware.bridge_state import as_data
     from skinware.memory.namespace import Namespace
 

@@ -13,7 +13,7 @@ import pytest
 import trustme
 
 from skinware import DriverReader
-from skinware.bridge import Rules, endpoints
+from skinware.bridge.endpoints import Rules, endpoints
 from skinware.errors import ConfigurationError, RequestFailed
 from skinware.memory.namespace import Namespace
 from skinware.service import ServiceReader, ServiceWriter

@@ -20,7 +20,10 @@ from links import descriptors, enter, memory_mb
 from record import BUS_COUNTERS, LEVELS, NOISE, PATCH_COUNTERS, structure_of
 
 from skinware import DriverWriter
-from skinware.bridge import Joiner, Link, Rules, Server, endpoints
+from skinware.bridge.endpoints import Rules, endpoints
+from skinware.bridge.joining import Joiner
+from skinware.bridge.link import Link
+from skinware.bridge.serving import Server
 from skinware.bridge_state import ServiceState
 from skinware.memory.namespace import Namespace
 from skinware.memory.statistics import BUCKETS

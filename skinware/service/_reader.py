@@ -35,7 +35,7 @@ class ServiceReader(Taking[SampleT]):
         announce: let others see this reader (``skin-info``).
 
     Attributes:
-        left_out: number of samples that ``read_next`` has left out because this program is too slow.
+        is_too_slow: the last ``read_next`` left samples out, since this program cannot catch up.
 
     Raises:
         ServiceNotFound: it did not appear in time.
@@ -52,7 +52,7 @@ class ServiceReader(Taking[SampleT]):
         announce: bool = True,
     ) -> None:
         super().__init__(name, namespace, timeout_s, announce)
-        self.left_out: int = 0
+        self.is_too_slow: bool = False
         self._waiting_then, self._may_come = 0, MAX_SLOTS
 
     @property
@@ -134,8 +134,7 @@ class ServiceReader(Taking[SampleT]):
         """Return the sample after the last one taken, and the newest at first: a program that was held up catches up.
 
         If half as many more come before it has (at least 4), it is too slow: it gets the newest ones. Each time that
-        it has none to catch up with, one more may come the next time. ``left_out`` counts what it did not get, as
-        ``missed`` does.
+        it has none to catch up with, one more may come the next time. ``missed`` counts what it did not get.
 
         Raises:
             ServiceTimeout, StructureChanged, Overrun, Closed: as ``read``.
@@ -147,11 +146,9 @@ class ServiceReader(Taking[SampleT]):
             self._may_come = max(0, self._may_come - max(0, waiting - before))
         elif waiting > 1:
             self._may_come = min(self._may_come, max(_LEAST_MAY_COME, waiting // 2))
-        is_too_slow = waiting > 1 and self._may_come == 0
-        self._waiting_then = 0 if is_too_slow else max(0, waiting - 1)
-        if is_too_slow:
-            self.left_out += waiting - 1
-        return self._take_turn(NEWER if is_too_slow else NEXT, _in_ns(timeout_s))
+        self.is_too_slow = waiting > 1 and self._may_come == 0
+        self._waiting_then = 0 if self.is_too_slow else max(0, waiting - 1)
+        return self._take_turn(NEWER if self.is_too_slow else NEXT, _in_ns(timeout_s))
 
     def latest(self) -> SampleT | None:
         """Return the newest sample at once, as a private copy; None if nothing was published yet.

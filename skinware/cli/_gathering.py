@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from skinware.cli import _command as cli
 from skinware.cli._heat_map import BACKGROUND, arrange
-from skinware.cli._terminal import are_terminals, echo, print_json, say, terminal_width
+from skinware.cli._terminal import are_terminals, echo, enter_pressed, print_json, say, terminal_width
 from skinware.driver_service import DriverReader
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry, geometry_to_toml, read_geometry
@@ -31,7 +31,7 @@ from skinware.tactile.calibration.shapes import Shape, shapes_of
 from skinware.tactile.calibration.sources import ForceSource, LoadSource, PoseSource
 from skinware.tactile.calibration.state import Session, restore_session, save_session
 from skinware.text import plural
-from skinware.views.live import after, enter_pressed, frames_until, reader_of
+from skinware.views.live import after, frames_until, reader_of
 
 SIGNS = "·▂▃▄▅▆▇█"
 """Signs of sensors from nothing to all that is wanted."""

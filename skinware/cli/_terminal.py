@@ -205,6 +205,24 @@ def are_terminals(*streams: TextIO | None) -> bool:
     return all(stream is not None and stream.isatty() for stream in streams)
 
 
+def has_keys() -> bool:
+    """Return whether this program may read keys of a terminal: in its background, it would be stopped."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        return False
+    try:
+        return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except OSError:  # it is the terminal of no session, or of another
+        return True
+
+
+def enter_pressed() -> bool:
+    """Return whether Enter was pressed at the terminal, and read the line."""
+    if not has_keys() or not select.select([sys.stdin], [], [], 0)[0]:
+        return False
+    sys.stdin.readline()
+    return True
+
+
 def terminal_width() -> int | None:
     """Return the columns of the terminal on stdout; None without a terminal, where lines may have any length."""
     return shutil.get_terminal_size().columns if are_terminals(sys.stdout) else None

@@ -7,12 +7,11 @@ import errno
 import json
 import os
 import re
-import select
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,38 +19,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import are_terminals, echo, print_json
+from skinware.cli._terminal import are_terminals, echo, enter_pressed, print_json
 from skinware.text import plural
 
 if TYPE_CHECKING:
     from skinware.recording.files import Target
     from skinware.recording.recorder import Recorder
-
-_LOOK_S = 0.1
-
-
-@contextlib.contextmanager
-def on_enter(call: Callable[[], object]) -> Iterator[None]:
-    """Call a function in another thread whenever Enter is pressed in this block; do nothing without a terminal."""
-    if not are_terminals(sys.stdin):
-        yield
-        return
-    ended, fd = threading.Event(), sys.stdin.fileno()
-
-    def listen() -> None:
-        while not ended.wait(_LOOK_S):
-            with contextlib.suppress(OSError):  # the terminal is gone
-                in_foreground = os.tcgetpgrp(fd) == os.getpgrp()  # a program that reads in the background is stopped
-                if in_foreground and select.select([fd], [], [], 0)[0] and os.read(fd, 4096).endswith(b"\n"):
-                    call()
-
-    thread = threading.Thread(target=listen, name="Enter", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def _listen_until_eof(mark: Callable[[str, int], object]) -> None:
@@ -158,10 +131,9 @@ def command(
     beside = Viewers().messages if for_viewers else None
     recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, renderer=beside)
     report = _Progress(recorder, target, path, as_json)
-    keys = on_enter(recorder.save) if last_s is not None else contextlib.nullcontext()
     if until_eof:
         threading.Thread(target=_listen_until_eof, args=(recorder.mark,), daemon=True).start()
-    with cli.signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}), keys:
+    with cli.signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}):
         report.ready(names, place.name, is_past=last_s is not None)
         try:
             recorder.run(duration_s, report.status)
@@ -202,6 +174,8 @@ class _Progress:
             echo(f"recording {what} of namespace {namespace!r} into {self._path} ({keys})")
 
     def status(self) -> None:
+        if self._is_past and enter_pressed():
+            self._recorder.save()
         self._news()
         messages = self._recorder.messages
         if self._as_json:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import say
+from skinware.cli._terminal import enter_pressed, say
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _paint(
 
     from skinware.tactile.neighbours import neighbours, without_holes
     from skinware.views.history import SETTLING_S, DriverRest, threshold
-    from skinware.views.live import after, enter_pressed, frames_until
+    from skinware.views.live import after, frames_until
 
     structure = reader.structure
     index, rest = structure.index(type_name), DriverRest(structure)

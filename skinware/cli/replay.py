@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skinware.cli import _command as cli
-from skinware.cli._terminal import are_terminals, echo, overwrite, print_json, say, terminal_width
+from skinware.cli._terminal import are_terminals, echo, has_keys, overwrite, print_json, say, terminal_width
 from skinware.errors import BadServiceFile, ConfigurationError, ServiceNotFound
 from skinware.limits import SLOWEST_REPLAY
 
@@ -52,11 +52,7 @@ class Terminal:
     @property
     def is_ours(self) -> bool:
         """Whether keys arrive here: there is a terminal, and this program is in its foreground."""
-        if not are_terminals(sys.stdin, sys.stdout):
-            return False
-        with contextlib.suppress(OSError):
-            return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
-        return False
+        return are_terminals(sys.stdout) and has_keys()
 
     @contextlib.contextmanager
     def keys(self) -> Iterator[None]:
@@ -136,8 +132,8 @@ def publish_again(
     with skinware.recording.open(file) as recording:
         replayer = Replayer(recording, names=names or None, namespace=place, **pace)
         terminal = Terminal(replayer)
-        has_keys = not as_json and terminal.is_ours
-        continued = {signal.SIGCONT: terminal.take} if has_keys else {}
+        is_steered = not as_json and terminal.is_ours
+        continued = {signal.SIGCONT: terminal.take} if is_steered else {}
         with contextlib.closing(replayer), cli.signals_end(replayer.stop, continued):
             published = list(names or recording.services)
             ready: dict[str, Any] = {"event": "ready", "file": str(file), "namespace": place.name, "names": published}
@@ -145,7 +141,7 @@ def publish_again(
             ends = "" if recording.is_whole else " (cut off or damaged)"
             text = f"{file}, {recording.duration_s:.1f} s{ends}: {', '.join(published) or 'nothing'} in"
             say(as_json, ready, f"{text} namespace {place.name!r} (Ctrl-C ends)")
-            if has_keys:
+            if is_steered:
                 echo(KEYS)
                 with terminal.keys():
                     replayer.run(terminal.draw, _DRAW_EVERY_S)

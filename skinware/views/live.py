@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import select
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
@@ -323,11 +321,3 @@ def frames_until(reader: DriverReader, is_over: Callable[[], bool]) -> Iterator[
 def after(seconds: float) -> Callable[[], bool]:
     end_s = time.monotonic() + seconds
     return lambda: time.monotonic() >= end_s
-
-
-def enter_pressed() -> bool:
-    """Return whether Enter was pressed at the terminal, and read the line; False without a terminal."""
-    if sys.stdin is None or not sys.stdin.isatty() or not select.select([sys.stdin], [], [], 0)[0]:
-        return False
-    sys.stdin.readline()
-    return True

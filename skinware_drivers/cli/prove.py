@@ -186,16 +186,12 @@ def _interrupted_once() -> Iterator[Callable[[], None]]:
         for number in numbers:
             signal.signal(number, signal.SIG_IGN)
 
-    def interrupt(_number: int, _frame: object) -> None:
+    def interrupt() -> None:
         undisturbed()
         raise KeyboardInterrupt
 
-    before = [signal.signal(number, interrupt) for number in numbers]
-    try:
+    with cli.signals_end(interrupt):
         yield undisturbed
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
 
 
 @contextlib.contextmanager

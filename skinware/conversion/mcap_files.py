@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -20,7 +19,7 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.memory.file_layout import SLOT
 from skinware.realtime import NS_PER_S
-from skinware.recording.files import Head, PendingChunk, RecordingFile
+from skinware.recording.files import Head, PendingChunk, RecordingFile, SampleStream
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, SCHEMAS, Channels
 from skinware.structure import Structure
@@ -87,18 +86,11 @@ def write_recording(source: TableSource, path: Path) -> None:
         file.finish()
 
 
-@dataclass
-class _CodedStream:
-    head: Head
-    generation: Generation
-    encoder: FrameEncoder
-
-
 class _RecordingWriter:
     def __init__(self, file: RecordingFile) -> None:
         self._file = file
         self._channels = Channels()
-        self._streams: dict[str, _CodedStream] = {}
+        self._streams: dict[str, SampleStream] = {}
         self.pending = PendingChunk()
 
     def add_frame(self, timed: TimedFrame) -> None:
@@ -107,10 +99,10 @@ class _RecordingWriter:
             number = 1 if stream is None else stream.head.sequence + 1
             channel, schema = self._channels.of_service(timed.service, GENERATION)
             head = Head(channel, schema, number, timed.generation.head)
-            stream = _CodedStream(head, timed.generation, FrameEncoder(timed.generation.coded))
+            stream = SampleStream(head, FrameEncoder(timed.generation.coded), timed.generation)
             self._streams[timed.service] = stream
         channel, schema = self._channels.of_service(timed.service, FRAME)
-        self.pending.add_sample(channel, schema, timed.frame, timed.time_ns, stream.encoder, stream.head)
+        self.pending.add_sample(channel, schema, timed.frame, timed.time_ns, stream)
 
     def add_json(self, topic: str, entry: dict[str, Any]) -> None:
         channel, schema = self._channels.of_all(topic)

@@ -19,6 +19,7 @@ from skinware.realtime import NS_PER_S
 from skinware.recording.mcap_reading import Damaged, McapSource
 from skinware.recording.mcap_writing import ClosedChunk, McapFile, OpenChunk
 from skinware.transfer.codec import FrameEncoder
+from skinware.transfer.generation import Generation
 
 _REPEATED_AFTER_NS = 60 * NS_PER_S
 _REPEATED_AFTER_BYTES = 64 << 20
@@ -38,6 +39,15 @@ class Head:
     schema: Schema
     sequence: int
     data: bytes
+
+
+@dataclass(frozen=True)
+class SampleStream:
+    """The samples of a generation on their way into chunks; ``generation``: None where it is not read."""
+
+    head: Head
+    encoder: FrameEncoder
+    generation: Generation | None
 
 
 class RecordingFile:
@@ -93,16 +103,15 @@ class PendingChunk:
         schema: Schema,
         sample: Sample,
         time_ns: int,
-        encoder: FrameEncoder,
-        head: Head,
+        stream: SampleStream,
         wall_ns: int | None = None,
     ) -> None:
         """Code a sample and add it; the first one of its channel becomes a key frame."""
         if not self.chunk.has(channel):
-            encoder.next_is_key()
-        self.heads.add(head)
+            stream.encoder.next_is_key()
+        self.heads.add(stream.head)
         self._decoded_size += len(sample.slot)
-        self.chunk.add(channel, schema, sample.sequence, time_ns, encoder.encode(sample), wall_ns)
+        self.chunk.add(channel, schema, sample.sequence, time_ns, stream.encoder.encode(sample), wall_ns)
 
     def move_to(self, target: Target | RecordingFile) -> None:
         """Close the chunk, add it to a target unless it is empty, and begin another."""

@@ -26,7 +26,7 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
-from skinware.recording.files import Head, PendingChunk, Target
+from skinware.recording.files import Head, PendingChunk, SampleStream, Target
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire import message_of
 from skinware.transfer.codec import CodedColumn, FrameEncoder
@@ -218,13 +218,6 @@ class Recorder:
         self._coder.jobs.put(partial(self._coder.add_json, EVENTS, event))
 
 
-@dataclass
-class _Stream:
-    head: Head
-    encoder: FrameEncoder
-    generation: Generation | None
-
-
 @dataclass(frozen=True)
 class _WireStream:
     driver: str
@@ -248,7 +241,7 @@ class _Coder(threading.Thread):
         self.failure: Exception | None = None
         self.jobs: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._target, self._disguise, self._renderer = target, disguise, renderer
-        self._streams: dict[str, _Stream | _WireStream | None] = {}  # None: it cannot be recorded
+        self._streams: dict[str, SampleStream | _WireStream | None] = {}  # None: it cannot be recorded
         self._pending = PendingChunk()
         self._abouts = 0
         self._due_ns = 0
@@ -291,7 +284,7 @@ class _Coder(threading.Thread):
             channel, schema = self.channels.of_service(service, FRAME)
             self._begin_chunk()
             time_ns, wall_ns = self._axis.log_ns(frame.published_ns), self._axis.wall_ns(frame.published_ns)
-            self._pending.add_sample(channel, schema, frame, time_ns, stream.encoder, stream.head, wall_ns)
+            self._pending.add_sample(channel, schema, frame, time_ns, stream, wall_ns)
             if self._renderer is not None and stream.generation is not None:
                 for topic, encoding, known, data in self._renderer(service, stream.generation, frame, time_ns):
                     self._add(*self.channels.of(topic, encoding, known), frame.sequence, frame.published_ns, data)
@@ -319,7 +312,7 @@ class _Coder(threading.Thread):
             with contextlib.suppress(BadRecording):  # an unreadable head is kept as it is
                 head = disguised(head, service, self._disguise)
         before = self._streams.get(service)
-        number = before.head.sequence + 1 if isinstance(before, _Stream) else 1
+        number = before.head.sequence + 1 if isinstance(before, SampleStream) else 1
         channel, schema = self.channels.of_service(service, GENERATION)
         columns = segment.layout.slot
         encoder = FrameEncoder([CodedColumn.of(column) for column in columns])
@@ -327,7 +320,7 @@ class _Coder(threading.Thread):
         if self._renderer is not None:
             with contextlib.suppress(BadRecording):  # viewers cannot show an unreadable driver
                 generation = Generation(head, service)
-        self._streams[service] = _Stream(Head(channel, schema, number, head), encoder, generation)
+        self._streams[service] = SampleStream(Head(channel, schema, number, head), encoder, generation)
 
     def _begin_wires(self, service: str, wires: _WireStream) -> None:
         if self._disguise is not None:

@@ -214,6 +214,7 @@ def command(
     FILE does not change; its damaged parts are left out and reported. The new file appears when it is complete.
     """
     from skinware.conversion import Selection, convert, convert_wires
+    from skinware.tactile.regions import SensorChoice
 
     if guess:
         from skinware.conversion.foreign import guess as guess_map
@@ -227,7 +228,8 @@ def command(
         raise click.UsageError("Missing option '--to'.")
     if map_file is not None:
         cli.refuse_others("--map", ["file", "map_file", "format_name", "output", "as_json"])
-    selection = Selection(names, types, patches, cli.regions_asked_for(in_regions, region_files), in_regions)
+    regions = cli.regions_asked_for(in_regions, region_files)
+    selection = Selection(names, SensorChoice(types, patches, regions, in_regions))
     if end_s is not None and end_s <= start_s:
         raise click.UsageError(f"--end {end_s:g} is not after --start {start_s:g}")
     source_of = click.get_current_context().get_parameter_source

@@ -22,7 +22,7 @@ from skinware.realtime import NS_PER_S
 from skinware.recording.reading import Recording
 from skinware.recording.tracks import Track
 from skinware.structure import Structure
-from skinware.tactile.regions import Regions, SensorChoice, unknown
+from skinware.tactile.regions import SensorChoice, unknown
 from skinware.transfer.generation import PER_SENSOR, Generation
 
 FRAMES, COLUMNS, PHYSICAL = "frames/", "columns/", "physical/"
@@ -228,26 +228,10 @@ def _physical(structure: Structure, type_name: str) -> Callable[[Block], npt.NDA
 
 @dataclass(frozen=True)
 class Selection:
-    """The services and sensors to convert. A choice of sensors leaves out services without sensors.
-
-    Attributes:
-        services: names; empty: all.
-        types: names of sensor types; empty: all.
-        patches: names of patches; empty: all.
-        regions: definitions of the regions in ``in_regions``.
-        in_regions: names of regions: only sensors in one of them; empty: all.
-    """
+    """The services to convert, by name (empty: all), and their sensors; a choice leaves out services without any."""
 
     services: Collection[str] = ()
-    types: Collection[str] = ()
-    patches: Collection[str] = ()
-    regions: Regions = field(default_factory=lambda: Regions(()))
-    in_regions: Collection[str] = ()
-
-    @property
-    def sensors(self) -> SensorChoice:
-        """The choice of sensors."""
-        return SensorChoice(self.types, self.patches, self.regions, self.in_regions)
+    sensors: SensorChoice = field(default_factory=SensorChoice)
 
 
 class RecordedTable(Table):

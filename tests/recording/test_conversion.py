@@ -27,7 +27,7 @@ from skinware.conversion.tables import ArrayFormat, RecordedSource, Table
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.geometry import Geometry
 from skinware.recording import Recording
-from skinware.tactile.regions import Region, Regions
+from skinware.tactile.regions import Region, Regions, SensorChoice
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure
 from tests.recording.damaging import frames_of, with_a_bad_chunk
@@ -223,9 +223,9 @@ def test_a_selection_has_what_was_asked_for_and_nothing_else(path: Path, tmp_pat
         start_s, end_s = 0.3 * opened_path.duration_s, 0.7 * opened_path.duration_s
     for number, selection in enumerate(
         [
-            Selection(["torso"], types=["temperature"]),
-            Selection(patches=["board 8"], types=["pressure"]),
-            Selection(regions=Regions([palm]), in_regions=["palm"]),
+            Selection(["torso"], SensorChoice(types=["temperature"])),
+            Selection(sensors=SensorChoice(patches=["board 8"], types=["pressure"])),
+            Selection(sensors=SensorChoice(regions=Regions([palm]), in_regions=["palm"])),
         ]
     ):
         convert(path, tmp_path / f"{number}.mcap", "mcap", selection, start_s=start_s, end_s=end_s)
@@ -262,10 +262,10 @@ def wanted(structure: Structure, number: int) -> npt.NDArray[np.int64]:
     ("selection", "words"),
     [
         (Selection(["leg"]), "no service 'leg'; there are: arm, pose, torso"),
-        (Selection(types=["force"]), "no sensor type 'force'; there are: pressure, temperature"),
-        (Selection(patches=["board 1"]), "no patch 'board 1'; there are: board 7, board 8"),
-        (Selection(in_regions=["palm"]), "no region 'palm'; there are: none"),
-        (Selection(["pose"], types=["pressure"]), "no sensor in it is selected"),
+        (Selection(sensors=SensorChoice(types=["force"])), "no sensor type 'force'; there are: pressure, temperature"),
+        (Selection(sensors=SensorChoice(patches=["board 1"])), "no patch 'board 1'; there are: board 7, board 8"),
+        (Selection(sensors=SensorChoice(in_regions=["palm"])), "no region 'palm'; there are: none"),
+        (Selection(["pose"], SensorChoice(types=["pressure"])), "no sensor in it is selected"),
     ],
 )
 def test_what_there_is_not_is_one_line(path: Path, tmp_path: Path, selection: Selection, words: str) -> None:

@@ -42,6 +42,7 @@ from skinware.conversion.tables import Table
 from skinware.errors import BadRecording, ConfigurationError
 from skinware.learning.images import Colours, TouchImage
 from skinware.skin_layout import SkinLayout
+from skinware.tactile.regions import SensorChoice
 from tests.cli.fake_skin import fake_structure
 from tests.recording.lerobot_format import Read, read_dataset
 from tests.recording.made import START_NS, MadeSource, MadeTable, generation_of_driver, generation_of_service
@@ -183,7 +184,7 @@ def test_a_selection_has_what_was_asked_for(tmp_path: Path) -> None:
     made = write(
         tmp_path / "walk.mcap", table_of("torso", structure, range(100)), table_of("arm", structure, range(100), seed=2)
     )
-    read = learn(made, selection=Selection(["arm"], types=["pressure"], patches=["board 8"]))
+    read = learn(made, selection=Selection(["arm"], SensorChoice(types=["pressure"], patches=["board 8"])))
     assert {name for name in read.features if name.startswith("obs")} == {
         f"{TACTILE}arm.{name}" for name in ("pressure", "pressure_status", "age")
     }
@@ -708,7 +709,7 @@ def good(table: MadeTable, rows: Sequence[int]) -> npt.NDArray[Any]:
 
 
 ROWS = [int(row / 30 * 100 + 1e-6) for row in range(60)]
-ONE_TYPE = Selection(types=("pressure",))
+ONE_TYPE = Selection(sensors=SensorChoice(types=("pressure",)))
 
 
 def test_touch_as_state_is_beside_the_joints(made: Made, tmp_path: Path) -> None:

@@ -198,7 +198,7 @@ def test_a_grid_is_an_image_with_a_pixel_for_each_sensor(tmp_path: Path) -> None
     structure = fake_structure(1, 1, dtype="<f4").replace(module_kind=["2x5"])
     types = [each.measured(unit=each.unit, scale=each.scale) for each in structure.types]  # of no range
     table = made_recording(tmp_path / "x.mcap", placed(structure.replace(types=types)), 10)
-    convert(tmp_path / "x.mcap", tmp_path / "shown.mcap", "foxglove", Selection(types=["pressure"]))
+    convert(tmp_path / "x.mcap", tmp_path / "shown.mcap", "foxglove")
     topic = "/skin/torso/image/board_7/pressure"
     image = decoded_messages(tmp_path / "shown.mcap", [topic])[0][1]
     assert (image.height, image.width, image.encoding, image.step) == (2, 5, "32FC1", 20)

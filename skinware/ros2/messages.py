@@ -80,7 +80,6 @@ DISCOVERY_TOPIC = "ros_discovery_info"
 """Where ROS 2 publishes, over DDS, which node has which endpoints."""
 PARTICIPANT_DATA = b"enclave=/;"
 """User data of a participant: without it, ROS does not count it as one of its own."""
-"""x, y, z (m), and the quaternion x, y, z, w of no rotation."""
 
 
 class DiagnosticLevel(IntEnum):

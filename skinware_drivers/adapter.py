@@ -62,7 +62,7 @@ class Adapter(HasOptions[OptionsT], ABC):
         by_cycle: publish when every live update group has arrived, or after a short wait (True); False: at the rate
             of ``period_s``.
         pace_per_ms: frames that may be sent within a millisecond on average; eight at once.
-        heard_by: receives the notices of ``tell``; the runner sets it.
+        heard_by: receives the notices of this driver; the runner sets it.
     """
 
     options_command = "skin-driver"
@@ -165,7 +165,7 @@ class Adapter(HasOptions[OptionsT], ABC):
         await self.start(link)
 
     async def attend(self, link: Link) -> None:
-        """Listen to devices that report their own state, from ``describe`` to the end; pass it on with ``tell``.
+        """Listen to devices that report their own state, from ``describe`` to the end; pass it on as a notice.
 
         ``link.follow`` returns frames that belong to no module. After a ``BusError``, ``attend`` is called again.
         """

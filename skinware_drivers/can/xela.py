@@ -33,8 +33,6 @@ _AXES = ("shear_x", "shear_y", "pressure")
 
 
 class XelaOptions(Options, frozen=True):
-    """Options of the driver, for every board of a bus."""
-
     boards: Annotated[tuple[int, ...], Meta(description="numbers of the boards, 1-15")] = (1,)
     ids: Annotated[
         Literal["consecutive", "row_column"],

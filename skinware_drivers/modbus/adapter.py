@@ -113,11 +113,7 @@ class ModbusAdapter(Adapter[OptionsT]):
         return Wanted(self.registers, *sizes, self.byte_order, self.word_order)
 
     def check(self) -> None:
-        """Check the driver and its registers.
-
-        Raises:
-            ConfigurationError: a declaration is missing, or contradicts another; the message says which.
-        """
+        """Check the driver and its registers."""
         is_declared, name = type(self).describe is Adapter.describe, type(self).__name__
         if is_declared and not self.registers:
             raise ConfigurationError(f"{name} has no `registers`")
@@ -137,11 +133,7 @@ class ModbusAdapter(Adapter[OptionsT]):
                 raise ConfigurationError(f"{block.name}: no module has the key {block.module}; there are: {there}")
 
     def fit(self, bus: Bus) -> None:
-        """Set what the bus asks for.
-
-        Raises:
-            ConfigurationError: it is another kind of bus.
-        """
+        """Set what the bus asks for."""
         super().fit(bus)
         self._line = bus if isinstance(bus, ModbusBus) else None
         self.use_registers(() if self.asks_first and not bus.listen_only else self.registers)

@@ -44,11 +44,7 @@ class SerialAdapter(Adapter[OptionsT]):
         return max(self.layout.payload_size, -(-self.framing.maximum_body // 8) * 8)
 
     def fit(self, bus: Bus) -> None:
-        """Give the line the framing, the encoding of commands and the baud rate.
-
-        Raises:
-            ConfigurationError: it is another kind of bus.
-        """
+        """Give the line the framing, the encoding of commands and the baud rate."""
         super().fit(bus)
         self._line = bus if isinstance(bus, SerialBus) else None
         self.change_framing(self.framing)

@@ -94,11 +94,7 @@ class Dev001Driver(SerialAdapter[Dev001Options]):
         self._is_started = False
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Listen which sensors send, once all were started.
-
-        Raises:
-            HandshakeTimeout: none does.
-        """
+        """Listen which sensors send, once all were started."""
         if not link.listen_only:
             self._is_started = False
             await self.start(link)
@@ -141,11 +137,7 @@ class Dev001Driver(SerialAdapter[Dev001Options]):
         await link.send(0, b"bias\n")
 
     async def heard(self, link: Link) -> set[int]:
-        """Return the ports whose sensors send.
-
-        Raises:
-            HandshakeTimeout: none does.
-        """
+        """Return the ports whose sensors send."""
         with link.follow(Match(0, 0)) as records:
             try:
                 async with asyncio.timeout(_FIRST_S):
@@ -187,11 +179,7 @@ class PapillArrayDriver(SerialAdapter[PapillArrayOptions]):
         self._described: Sequence[Patch] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Learn from a packet how many sensors there are, with how many pillars, and what is sent of them.
-
-        Raises:
-            BusError: no sensor is plugged in, or no packet came.
-        """
+        """Learn from a packet how many sensors there are, with how many pillars, and what is sent of them."""
         if not link.listen_only:
             await self.configure(link)
         self.change_framing(PapillArrayPackets())  # the first packet says what there is
@@ -247,11 +235,7 @@ class PapillArrayDriver(SerialAdapter[PapillArrayOptions]):
 
     @staticmethod
     async def listen(link: Link) -> Mapping[int, int]:
-        """Return identifier and length of each frame of a packet.
-
-        Raises:
-            HandshakeTimeout: no packet came.
-        """
+        """Return identifier and length of each frame of a packet."""
         heard: dict[int, int] = {}
         try:
             with link.follow(Match(0, 0)) as frames:

@@ -51,11 +51,7 @@ class Lines(Stuffing):
         return size + 1
 
     def encode(self, content: bytes) -> bytes:
-        """Return the line with its end.
-
-        Raises:
-            ValueError: the content has an end of line in it.
-        """
+        """Return the line with its end."""
         if b"\n" in content:
             raise ValueError(f"a line with an end of line in it: {content!r}")
         return content + b"\n"

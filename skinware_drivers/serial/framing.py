@@ -131,11 +131,7 @@ class ReceivedFraming(Framing):
     """The framing of a stream that is only read."""
 
     def encode(self, identifier: int, payload: bytes) -> bytes:
-        """Refuse to make a frame.
-
-        Raises:
-            ValueError: always.
-        """
+        """Refuse to make a frame."""
         raise ValueError(f"frames of this device are only read ({identifier:#x}, {len(payload)} bytes)")
 
 

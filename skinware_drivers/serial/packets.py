@@ -238,9 +238,6 @@ class Packet(CompiledFraming):
         """Return a frame as it is sent; bytes of the header that the declaration leaves open are zero.
 
         Identifier and length are written at their places, also over the payload.
-
-        Raises:
-            ValueError: there is no such frame.
         """
         least = self.shortest - self.body_start - self.behind if isinstance(self.length, int) else 0
         check_body(identifier, payload, self.identifier, least, self.maximum_body)

@@ -37,7 +37,7 @@ _THREAD_END_S, _CLOSE_S = 0.25, 0.8
 
 
 class Port(ABC):
-    """An open serial line; no call blocks.
+    """An open serial line; no call blocks, and one that finds it gone raises :class:`BusNotAvailable`.
 
     Attributes:
         longest_wait: bytes that may wait until it takes them. 0: bytes that are written together stay together.

@@ -187,11 +187,7 @@ class RobotiqTsfDriver(SerialAdapter[RobotiqTsfOptions]):
         self.period_s: float = options.period_ms / 1e3
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Listen to what the sensor sends, once it was asked to send by itself.
-
-        Raises:
-            BusError: it sends nothing.
-        """
+        """Listen to what the sensor sends, once it was asked to send by itself."""
         if not link.listen_only:
             await self.start(link)
         self.change_framing(RobotiqPackets(times=True))
@@ -205,11 +201,7 @@ class RobotiqTsfDriver(SerialAdapter[RobotiqTsfOptions]):
         return [self._finger(finger, heard) for finger in sorted({identifier & 3 for identifier in heard})]
 
     async def _hear(self, link: Link) -> dict[int, list[tuple[int, int]]]:
-        """Return when fields came, ns, and their times, by identifier.
-
-        Raises:
-            BusError: none came.
-        """
+        """Return when fields came, ns, and their times, by identifier."""
         heard: dict[int, list[tuple[int, int]]] = {}
         with link.follow(Match(0, 0)) as frames:
             for _ in range(round(_FIRST_S / self.options.learn_s) + 1):

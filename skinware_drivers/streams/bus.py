@@ -118,9 +118,6 @@ def _mistake(channel: str) -> str:
 class StreamBus(SerialBus):
     """A bus that programs or networks carry, with options of its own.
 
-    Raises:
-        ConfigurationError: the channel names no place, or an option is unknown or has a bad value.
-
     Attributes:
         scheme: of its name, ``SCHEME://CHANNEL``.
     """
@@ -178,11 +175,7 @@ class MessageBus(StreamBus):
         return False
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames of the messages that have arrived, at most ``batch.free``.
-
-        Raises:
-            BusNotAvailable: the port cannot be used any more.
-        """
+        """Append the frames of the messages that have arrived, at most ``batch.free``."""
         taken = 0
         for _ in range(self.most_messages):
             bytes_before = self.counters.framing.bytes_in
@@ -229,31 +222,18 @@ class ServerBus(MessageBus):
     _heard_ns = 0
 
     def open(self) -> None:
-        """Connect.
-
-        Raises:
-            BusNotAvailable: no program answers there, or another one does.
-        """
         super().open()
         self._heard_ns = now_ns()
 
     def check(self) -> None:
-        """Check that the other end still sends.
-
-        Raises:
-            BusNotAvailable: it has been silent for too long.
-        """
+        """Check that the other end still sends."""
         super().check()
         silence_s = self._options.silence_s
         if self._port is not None and silence_s and now_ns() - self._heard_ns > silence_s * NS_PER_S:
             raise BusNotAvailable(f"{self.name}: connected, but no message for {silence_s:g} s; connecting again")
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Refuse: it is only read.
-
-        Raises:
-            BusSendError: always.
-        """
+        """Refuse to send: it is only read."""
         self.counters.send_failures += 1
         raise BusSendError(f"{self.name} is only read ({identifier:#x}, {len(payload)} bytes)")
 

@@ -299,10 +299,6 @@ class DdsBus(TopicBus):
     """Topics of a domain. Its name is ``dds://DOMAIN?key=value``, with the number of the domain.
 
     It joins the domain as one participant, which publishes no topic, and never asks a publisher to send more.
-
-    Raises:
-        ConfigurationError: no such domain, an option is unknown or has a bad value, or the package cyclonedds is
-            missing.
     """
 
     scheme: ClassVar[str] = "dds"
@@ -356,11 +352,7 @@ class DdsAdapter(SerialAdapter[OptionsT]):
             log.warning("%s", text)
 
     def fit(self, bus: Bus) -> None:
-        """Give the bus framing and topics.
-
-        Raises:
-            ConfigurationError: it is another kind of bus.
-        """
+        """Give the bus framing and topics."""
         super().fit(bus)
         if isinstance(bus, TopicBus):
             bus.topics = self.topics

@@ -55,10 +55,6 @@ class DdsPort(TopicPort):
 
     Args:
         name: of the bus, for messages.
-
-    Raises:
-        BusNotAvailable: the domain cannot be joined.
-        ConfigurationError: both the bus and ``CYCLONEDDS_URI`` choose networks.
     """
 
     def __init__(self, name: str, domain: int, options: DdsOptions, topics: Sequence[DdsTopic]) -> None:
@@ -89,11 +85,7 @@ class DdsPort(TopicPort):
                     self._subscribe(number)
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """Return records of samples that have come, at most a few of each topic.
-
-        Raises:
-            BusNotAvailable: the participant cannot be used any more.
-        """
+        """Return records of samples that have come, at most a few of each topic."""
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self._event)
         time_ns = now_ns()

@@ -96,12 +96,6 @@ def _topics(beginning: str, sides: Sequence[str]) -> list[DdsTopic]:
 
 
 class Dex3Options(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or a name is not of the form 0=thumb tip.
-    """
-
     hands: Annotated[
         Literal["heard", "both", "left", "right"], Meta(description="hands to read; heard: those that publish")
     ] = "heard"
@@ -119,11 +113,7 @@ class Dex3Options(Options, frozen=True):
         self.named()
 
     def named(self) -> dict[int, str]:
-        """Return the names of pads, by number.
-
-        Raises:
-            ConfigurationError: one is not of the form 0=thumb tip, or there is no such pad.
-        """
+        """Return the names of pads, by number."""
         named = {}
         for text in self.names:
             number, equals, name = text.partition("=")
@@ -179,11 +169,7 @@ class Dex3Driver(DdsAdapter[Dex3Options]):
         self.geometry: Geometry | None = None
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Return the hands of the options, or those that are heard.
-
-        Raises:
-            BusError: none is heard.
-        """
+        """Return the hands of the options, or those that are heard."""
         return await self.join(link, ())
 
     async def join(self, link: Link, known: Sequence[Patch]) -> Sequence[Patch]:

@@ -112,11 +112,7 @@ class IcubEthOptions(Options, frozen=True):
         self.of_roboskin()
 
     def of_roboskin(self) -> RoboskinOptions:
-        """Return them as options of the driver of the boards on CAN.
-
-        Raises:
-            ConfigurationError: an option is out of its limits.
-        """
+        """Return them as options of the driver of the boards on CAN."""
         given = msgspec.structs.asdict(self)
         del given["port"]
         return RoboskinOptions(**given)
@@ -139,11 +135,7 @@ class IcubEthDriver(SerialAdapter[IcubEthOptions]):
         self.layout, self.period_s = self._boards.layout, self._boards.period_s
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Learn the boards and modules from the data.
-
-        Raises:
-            BusError: there are no skin data.
-        """
+        """Learn the boards and modules from the data."""
         patches = self._boards.patches_heard(await link.listen(self.options.learn_s), ())
         if not patches:
             raise BusError(f"{link.bus_name}: no skin data: has the robot's program started the skin of this board?")

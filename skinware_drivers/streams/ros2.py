@@ -54,12 +54,6 @@ Key = tuple[str, str]
 
 
 class Ros2Options(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or a type or the map is wrong.
-    """
-
     topic: Annotated[
         tuple[str, ...], Meta(description="topics; with =TYPE if not any known type is to be read, as /t=std_msgs/Int8")
     ] = ("/touch",)
@@ -103,11 +97,7 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         self._described: Sequence[Patch] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Learn the modules of the first messages.
-
-        Raises:
-            HandshakeTimeout: no messages that can be read came; the message says which topics there are.
-        """
+        """Learn the modules of the first messages."""
         self._parts.clear()
         self._plans.clear()
         return await self.join(link, ())
@@ -286,11 +276,7 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
 
 
 def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Making]]:
-    """Return topics to read, each once for each type that it may have, and what makes parts of their messages.
-
-    Raises:
-        ConfigurationError: too many, or a type or the map is wrong.
-    """
+    """Return topics to read, each once for each type that it may have, and what makes parts of their messages."""
     found = []
     if options.map:
         for ordinal, (name, definitions, making) in enumerate(read_map(options.map)):

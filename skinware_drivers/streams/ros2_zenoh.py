@@ -50,9 +50,6 @@ class ZenohTopicBus(TopicBus):
 
     It joins the graph as a session without a node. Samples that a publisher numbered and that did not come are counted
     as dropped.
-
-    Raises:
-        ConfigurationError: no such domain, or an option is unknown or has a bad value.
     """
 
     scheme: ClassVar[str] = "ros2"
@@ -83,10 +80,6 @@ class ZenohPort(TopicPort):
 
     Args:
         name: of the bus, for messages.
-
-    Raises:
-        BusNotAvailable: there can be no session.
-        ConfigurationError: a router is malformed.
     """
 
     def __init__(self, name: str, domain: int, options: ZenohOptions, topics: Sequence[DdsTopic]) -> None:

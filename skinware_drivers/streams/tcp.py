@@ -60,9 +60,6 @@ class ListeningPort(Port):
 
     Attributes:
         caller: the connection; None: there is none.
-
-    Raises:
-        BusNotAvailable: it cannot listen there.
     """
 
     def __init__(self, address: Address, patience_s: int) -> None:

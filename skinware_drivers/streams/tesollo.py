@@ -147,11 +147,7 @@ class TesolloDriver(SerialAdapter[TesolloOptions]):
         return [Poll(_ASK, _EVERYTHING, self.period_s, Match(_FINGER, 0x700), self.options.timeout_ms / 1e3)]
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Ask the hand for its model and its sensors.
-
-        Raises:
-            BusError: it does not answer, has no sensors, is not known, or must not be asked.
-        """
+        """Ask the hand for its model and its sensors."""
         if link.listen_only:
             raise BusError("a hand of Tesollo only answers: listening is not enough")
         self.change_framing(type(self).framing)

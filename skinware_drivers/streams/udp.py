@@ -40,9 +40,6 @@ class UdpPort(MessagePort):
     Attributes:
         refused: datagrams of other senders.
         peer: the other end; None: none has sent yet.
-
-    Raises:
-        BusNotAvailable: the name of the host is not known, or the port is taken.
     """
 
     longest_wait = 0
@@ -70,11 +67,7 @@ class UdpPort(MessagePort):
         return self._socket.fileno()
 
     def read(self, size: int) -> bytes:
-        """Return the next datagram of the other end, or nothing; empty ones do not count.
-
-        Raises:
-            BusNotAvailable: the socket cannot be used any more.
-        """
+        """Return the next datagram of the other end, or nothing; empty ones do not count."""
         while True:
             try:
                 data, sender = self._socket.recvfrom(size)
@@ -119,9 +112,6 @@ class UdpBus(MessageBus, NetworkBus):
 
     A framing finds frames in the joined content of the datagrams, as converters of serial lines send it. With
     ``Unframed``, each datagram is a frame.
-
-    Raises:
-        ConfigurationError: no such address, or an option of :class:`UdpOptions` is unknown or has a bad value.
     """
 
     scheme: ClassVar[str] = "udp"

@@ -65,9 +65,6 @@ class WebSocketPort(MessagePort):
 
     Attributes:
         refused: messages that were too long, or broke off.
-
-    Raises:
-        BusNotAvailable: no websocket server answers there.
     """
 
     longest_wait = 0
@@ -98,11 +95,7 @@ class WebSocketPort(MessagePort):
         return self._socket.fileno()
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """Return the next message as one line, or nothing.
-
-        Raises:
-            BusNotAvailable: the connection is closed; the message says by which end, and with which code.
-        """
+        """Return the next message as one line, or nothing."""
         if not self._messages:
             self._listen()
         return self._messages.popleft() if self._messages else b""
@@ -202,9 +195,6 @@ class ServingPort(Port):
     Args:
         address: at which to listen; port 0: any that is free, which ``note`` shows.
         patience_s: seconds without a sign of the caller until it is given up.
-
-    Raises:
-        BusNotAvailable: it cannot listen there.
     """
 
     def __init__(self, address: Address, patience_s: int) -> None:
@@ -266,9 +256,6 @@ class WebSocketBus(ServerBus):
     A framing finds frames in its messages. Each gets an end of line, and those within it become spaces. Messages of
     64 KiB and more, and one that breaks off with the connection, are counted as refused. After a server has closed the
     connection, or sent no message for ``silence_s``, it is connected to again after growing pauses.
-
-    Raises:
-        ConfigurationError: no such URL, or an option is unknown or has a bad value.
     """
 
     scheme: ClassVar[str] = "websocket"
@@ -281,11 +268,7 @@ class WebSocketBus(ServerBus):
         return parse_address("ws", split_url(channel), default_port=_HTTP)
 
     def open(self) -> None:
-        """Connect; a message that came with the server's greeting is read at once.
-
-        Raises:
-            BusNotAvailable: no websocket server answers there.
-        """
+        """Connect; a message that came with the server's greeting is read at once."""
         super().open()
         self._read_on()
 

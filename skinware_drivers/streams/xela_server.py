@@ -204,11 +204,7 @@ class XelaServerDriver(SerialAdapter[XelaServerOptions]):
         self._known: Seen = {}
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Learn the sensors from the first messages.
-
-        Raises:
-            BusError: there are no messages with sensors.
-        """
+        """Learn the sensors from the first messages."""
         with link.follow(_STRUCTURE) as lists:
             self.change_framing(XelaMessages())  # lists them again
             try:

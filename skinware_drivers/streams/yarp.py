@@ -74,12 +74,6 @@ class Triangles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class YarpOptions(Options, frozen=True):
-    """Options of the driver.
-
-    Raises:
-        ConfigurationError: an option is out of its limits, or triangles do not lie in the vector.
-    """
-
     values: Annotated[
         Literal["compensated", "raw"],
         Meta(description="compensated: 0 is no touch; raw: the values of the boards, where less is more pressure"),
@@ -141,11 +135,7 @@ class YarpDriver(SerialAdapter[YarpOptions]):
         self._described: Sequence[Patch] = ()
 
     async def describe(self, link: Link) -> Sequence[Patch]:
-        """Return the boards of the options, or patches for as many values as the port sends.
-
-        Raises:
-            BusError: the number of values is not known, and no message comes.
-        """
+        """Return the boards of the options, or patches for as many values as the port sends."""
         if self.options.triangles:
             self._described, parts = self._of_boards()
         else:

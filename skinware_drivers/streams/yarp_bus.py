@@ -103,9 +103,6 @@ class ServedPort(Port):
         address: of the name server; port 0: any that is free, which ``note`` shows.
         name: of the port, which listens at the same host.
         patience_s: seconds without a sign of a caller until it is given up.
-
-    Raises:
-        BusNotAvailable: it cannot listen there.
     """
 
     def __init__(self, address: Address, name: str, patience_s: int) -> None:
@@ -221,11 +218,7 @@ class YarpPort(MessagePort, TcpPort):
         self._rest = b""
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
-        """Return the messages that have come, at most about 64 KiB, and bytes that are no message.
-
-        Raises:
-            BusNotAvailable: the port is gone.
-        """
+        """Return the messages that have come, at most about 64 KiB, and bytes that are no message."""
         pile = self._rest
         for _ in range(_MOST_PILES):
             more = super().read(_PILE)
@@ -248,12 +241,7 @@ class YarpPort(MessagePort, TcpPort):
 
 
 def _begin_reading(connection: socket.socket, name: str) -> None:
-    """Greet a port and ask it to send.
-
-    Raises:
-        BusNotAvailable: another kind of program answers.
-        OSError: it hung up, or did not answer in time.
-    """
+    """Greet a port and ask it to send."""
     connection.settimeout(_GREETING_S)
     connection.sendall(Carrier.FAST_TCP.greeting(WHO))
     answer = b""
@@ -272,9 +260,6 @@ class YarpBus(ServerBus):
 
     Args:
         channel: ``HOST:PORT/NAME`` or ``/NAME``.
-
-    Raises:
-        ConfigurationError: no such name, or an option is unknown or has a bad value.
     """
 
     scheme: ClassVar[str] = "yarp"

@@ -134,11 +134,7 @@ class VirtualCanBus(EmulatedBus):
         return -1 if self._timer is None else self._timer.fileno()
 
     def receive(self, batch: FrameBatch, ordinal: int) -> int:
-        """Append the frames that are due, at most ``batch.free``; the others stay, and the bus stays readable.
-
-        Raises:
-            BusNotAvailable: the bus is closed, or :meth:`vanish` or :meth:`fail_next_receive` was called.
-        """
+        """Append the frames that are due, at most ``batch.free``; the others stay, and the bus stays readable."""
         if self._next_error is not None:
             error, self._next_error = self._next_error, None
             raise error
@@ -165,11 +161,7 @@ class VirtualCanBus(EmulatedBus):
         return len(frames)
 
     def send(self, identifier: int, payload: bytes) -> None:
-        """Send one frame to the devices.
-
-        Raises:
-            BusSendError: the bus is closed, away or only listens, or the payload is too long for it.
-        """
+        """Send one frame to the devices."""
         try:
             self.may_send_by(None if self._is_away else self._timer)
             if len(payload) > self.payload_size:

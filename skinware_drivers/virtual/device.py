@@ -195,11 +195,7 @@ DATA = "data"
 
 
 class EmulatorOptions(Options, frozen=True):
-    """Touch and faults; an emulator adds options for its devices.
-
-    Raises:
-        ConfigurationError: an option is out of its limits.
-    """
+    """Touch and faults; an emulator adds options for its devices."""
 
     pattern: Annotated[
         Literal["touch", "idle", "cycle"],

@@ -35,9 +35,6 @@ class SerialEmulator(Emulator[OptionsT]):
     Attributes:
         speed_mbit_s: of the line.
         datagrams: each message is a datagram of its own, as over UDP, not part of a stream.
-
-    Raises:
-        ConfigurationError: the options ask for frames of other devices, which a line does not have.
     """
 
     medium = "serial"

@@ -76,8 +76,8 @@ class Stage(ABC, HasOptions[OptionsT]):
         self._scheduled: list[tuple[int, Callable[[int], object]]] = []
         self._now_ns: int | None = None
         self._event_ns: int | None = None
-        for name in ("dead", "restart", "faulty"):
-            for number in getattr(options, name, ()):
+        for name in ("dead", "restart"):
+            for number in getattr(options, name):
                 if number not in self.numbers:
                     known = ",".join(map(str, self.numbers))
                     raise ConfigurationError(f"option {name}: there is no device {number}; there are {known}")

@@ -121,20 +121,6 @@ def test_errors_make_a_node_suspect_until_they_are_over(stage: Stage, caplog: py
     assert caplog.text.count("node 5 reports an error: Temperature (code 4210)") == 1
 
 
-@pytest.mark.thorough
-def test_emulated_nodes_report_errors_when_told_to() -> None:
-    async def scenario() -> None:
-        faults = {"faulty": (6,), "faulty_after_s": 0.5, "faulty_for_s": 0.2}
-        async with Bench(Case(CanopenDriver, EmulatedCanopen, {"nodes": (5, 6)}), **faults) as bench:
-            await bench.run(1000)
-            assert bench.notices == [("node 6", Notice.SUSPECT), ("node 6", Notice.SOUND)]
-            assert [e.code for e in bench.log if e.event == "error_reported"] == [0x4210, 0]
-
-    play(scenario())
-    with pytest.raises(ConfigurationError, match="option faulty: there is no device 7"):
-        EmulatedCanopen(EmulatedCanopenOptions(faulty=(7,)))
-
-
 def test_a_node_that_boots_after_an_error_is_sound(stage: Stage) -> None:
     stage.do("report_error", 6, 0x8110)
     stage.read(lambda f: bool(f.status[16] & SUSPECT))

@@ -9,14 +9,12 @@ from __future__ import annotations
 import logging
 import struct
 from collections.abc import Collection, Sequence
-from functools import partial
 from importlib import resources
 from typing import Annotated, Any
 
 from msgspec import Meta
 
 from skinware_drivers.virtual import CanFrame, Device, Emulator, EmulatorOptions, Places, on_a_grid
-from skinware_drivers.virtual.device import Seconds
 from skinware_drivers.virtual.hardware import Event
 
 _HEARTBEAT = "heartbeat"
@@ -24,16 +22,12 @@ _BOOT_UP, _STOPPED, _OPERATIONAL, _PRE_OPERATIONAL = 0, 4, 5, 127
 _STATES = {1: _OPERATIONAL, 2: _STOPPED, 128: _PRE_OPERATIONAL}
 _RESETS = (129, 130)
 _TYPE_EVENT = 254
-_TOO_HOT = 0x4210
 _REAL32 = 8
 
 
 class EmulatedCanopenOptions(EmulatorOptions, frozen=True):
     nodes: Annotated[tuple[int, ...], Meta(description="node ids of the patches, 1-127")] = (5, 6)
     eds: Annotated[str, Meta(description="EDS file; default: the example's")] = ""
-    faulty: Annotated[tuple[int, ...], Meta(description="nodes that report an error for a while (EMCY 4210)")] = ()
-    faulty_after_s: Annotated[Seconds, Meta(description="seconds from power-up to the error")] = 2.0
-    faulty_for_s: Annotated[Seconds, Meta(description="seconds until it is over")] = 2.0
 
 
 class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
@@ -58,14 +52,6 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
         mapped = [variable for _, entries in _tpdos(_make_node(self.options.eds, 1, None)) for variable, _ in entries]
         count = sum(_is_felt(variable) for variable in mapped)
         return on_a_grid(count, max(1, round(count**0.5)))
-
-    def power_up(self, now_ns: int) -> None:
-        super().power_up(now_ns)
-        options = self.options
-        for number in options.faulty:
-            for after_s, code in ((0, _TOO_HOT), (options.faulty_for_s, 0)):
-                at_ns = now_ns + round((options.faulty_after_s + after_s) * 1e9)
-                self.schedule(at_ns, partial(self._report, self.devices[number], code))
 
     def boot(self, device: Device, now_ns: int) -> None:
         """Send the boot-up message and be pre-operational, or with ``streaming`` operational."""
@@ -117,10 +103,7 @@ class EmulatedCanopen(Emulator[EmulatedCanopenOptions]):
 
     def report_error(self, number: int, code: int, now_ns: int) -> None:
         """Send an EMCY: an error, or with code 0 its end."""
-        self._report(self.devices[number], code, self.run_to(now_ns))
-        self.find_next_event()
-
-    def _report(self, device: Device, code: int, now_ns: int) -> None:
+        now_ns, device = self.run_to(now_ns), self.device(number)
         if device.alive and now_ns >= device.ready_ns:
             self.reply(device, (0x080 + device.number, struct.pack("<HB5x", code, int(code != 0))), now_ns)
             self.log.append(Event("error_reported", now_ns, board=device.number, code=code))

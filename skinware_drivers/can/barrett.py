@@ -37,7 +37,7 @@ from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
 FIRST_NODE, LAST_NODE = 11, 14
 CELLS = 24
 HAND_GROUP = 0x405
-_VERSION, _SET = 0, 0x80
+_VERSION, _TACT, _SET = 0, 106, 0x80
 _REPLY_S = 0.1
 _NODE = Bits(shift=5, width=5)
 _PA_PER_N_CM2 = 1e4
@@ -78,7 +78,6 @@ class BarrettOptions(Options, frozen=True):
         Literal["full", "top10"], Meta(description="all cells in 12 bits, or the ten strongest in four")
     ] = "full"
     period_ms: Annotated[int, Meta(description="time between two requests, ms", ge=5, le=1000)] = 20
-    tact: Annotated[int, Meta(description="number of the property TACT, by firmware", ge=1, le=127)] = 106
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -117,7 +116,7 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
 
     @property
     def polls(self) -> Sequence[Poll]:
-        return (Poll(HAND_GROUP, bytes([self.options.tact]), self.period_s),)
+        return (Poll(HAND_GROUP, bytes([_TACT]), self.period_s),)
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Return the nodes of the options, if at least one of them answers; a listener does not ask."""
@@ -139,7 +138,7 @@ class BarrettDriver(CanAdapter[BarrettOptions]):
 
     async def revive(self, link: Link, patch: Patch) -> None:
         value = 2 if self.options.format == "full" else 1
-        await link.send(patch.key, bytes((_SET | self.options.tact, 0)) + value.to_bytes(4, "little"))
+        await link.send(patch.key, bytes((_SET | _TACT, 0)) + value.to_bytes(4, "little"))
 
     async def _answers(self, link: Link, node: int) -> bool:
         reply = Match(node << 5, mask=0x3E0, prefix=bytes([_SET | _VERSION]))

@@ -205,12 +205,6 @@ def test_a_barrett_hand_is_asked_by_group_5() -> None:
     assert heard[6] == (0x405, "6a")
 
 
-def test_a_barrett_hand_with_another_number_for_tact() -> None:
-    version = {(11, "00"): [(0x406 | 11 << 5, "8000C900")]}
-    adapter = BarrettDriver(BarrettOptions(nodes=(11,), tact=99, format="top10"))
-    assert sent_by(adapter, [(0x405, "63")], answers=version)[1:3] == [(11, "e30001000000"), (0x405, "63")]
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [({"nodes": (10,)}, "the hand has 11 to 14"), ({"nodes": ()}, "at least one"), ({"period_ms": 1}, "period_ms=1")],

@@ -230,6 +230,9 @@ class StatusBytes:
     mask: Status
 
 
+NO_NUMBER: Sequence[Sentinel] = tuple(Sentinel(Status.SUSPECT, value) for value in (np.nan, np.inf, -np.inf))
+"""Values of floating point that are no numbers."""
+
 AnyFlag = Flag | Sentinel | Above | StatusBytes
 
 

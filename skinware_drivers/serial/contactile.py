@@ -28,9 +28,8 @@ from msgspec import Meta
 from skinware.errors import BusError, HandshakeTimeout
 from skinware.geometry import Geometry
 from skinware.sensor_types import FORCE, TEMPERATURE, SensorType
-from skinware.status import Status
 from skinware_drivers import Link, Match, Module, Notice, Options, Patch, Sensor, operation
-from skinware_drivers.fields import Bits, DeviceTime, Identifier, Sentinel, SequenceNumber
+from skinware_drivers.fields import NO_NUMBER, Bits, DeviceTime, Identifier, SequenceNumber
 from skinware_drivers.hand import Grid, Place
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.serial import Field, Packet, SerialAdapter, Unframed
@@ -75,7 +74,6 @@ class Dev001Driver(SerialAdapter[Dev001Options]):
         size = _HEAD + 4 * len(names)
         self.framing = Packet(sync=possible, length=size, header=_BEFORE_BODY, identifier=Field(0), confirmed="each")
         values = Values(_HEAD - _BEFORE_BODY, "<f4", len(names))
-        no_number = [Sentinel(Status.SUSPECT, value) for value in (math.nan, math.inf, -math.inf)]
         self.layout = Layout(
             [
                 Frame(
@@ -84,7 +82,7 @@ class Dev001Driver(SerialAdapter[Dev001Options]):
                     [values.end],
                     values,
                     module=Bits(shift=0, width=3),
-                    flags=no_number,
+                    flags=NO_NUMBER,
                     time=DeviceTime(0, "<u4", 1e-3),
                 )
             ]
@@ -258,7 +256,7 @@ def _frame(name: str, key: int, count: int, *, counted: bool) -> Frame:
         [values.end],
         values,
         module=key,
-        flags=[Sentinel(Status.SUSPECT, value) for value in (math.nan, math.inf, -math.inf)],
+        flags=NO_NUMBER,
         sequence=SequenceNumber(0, "<u4") if counted else None,
         time=DeviceTime(4, "<u4", 1e-6),
     )

@@ -25,7 +25,7 @@ from skinware.ros_types import Definitions
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.fields import AnyFlag, Identifier, Match, Sentinel, StatusBytes
+from skinware_drivers.fields import NO_NUMBER, AnyFlag, Identifier, Match, StatusBytes
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
@@ -47,7 +47,6 @@ _FIRST_S, _LISTEN_S, _AGAIN_S = 5.0, 0.05, 5.0
 _LIST_EVERY = 64
 _NUMBER = struct.Struct("<H")
 _DTYPES = (np.uint8, np.int16, np.uint16, np.int32, np.float32)
-_NO_NUMBER = tuple(Sentinel(Status.SUSPECT, value) for value in (np.nan, np.inf, -np.inf))
 
 Key = tuple[str, str]
 """Names of a patch and a module."""
@@ -298,7 +297,7 @@ def _topics(options: Ros2Options) -> list[tuple[DdsTopic, Making]]:
 def _frame(number: int, part: ModulePart, patch: int, *, is_timed: bool) -> Frame:
     count = part.taxels * len(part.types)
     end = SOURCE_TIME.end + count * part.dtype.itemsize
-    flags: list[AnyFlag] = list(_NO_NUMBER) if part.dtype.kind == "f" else []
+    flags: list[AnyFlag] = list(NO_NUMBER) if part.dtype.kind == "f" else []
     if part.doubt is not None:
         flags.append(StatusBytes(end, Status.SUSPECT))
     return Frame(

@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
@@ -24,10 +23,9 @@ from msgspec import Meta
 
 from skinware.errors import BusError, ConfigurationError
 from skinware.sensor_types import PRESSURE, TEMPERATURE, SensorType
-from skinware.status import Status
 from skinware_drivers.can.roboskin_layout import CHANNELS, NON_TACTILE, TRIANGLES
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.fields import Bits, DeviceTime, Identifier, Match, Sentinel
+from skinware_drivers.fields import NO_NUMBER, Bits, DeviceTime, Identifier, Match
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import Options
@@ -43,7 +41,6 @@ _LENGTHS = Match(LENGTH << 8)
 _KIND = 0x700
 _OF_A_BOARD = TRIANGLES * CHANNELS
 _MOST_PATCHES = 16
-_NO_NUMBER = tuple(Sentinel(Status.SUSPECT, value) for value in (math.nan, math.inf, -math.inf))
 _COMPENSATED = (PRESSURE.measured(unit="counts", minimum=0.0, maximum=255.0),)
 _RAW = (
     PRESSURE.measured(unit="counts", scale=-1.0, offset=255.0, minimum=0.0, maximum=255.0),
@@ -120,7 +117,7 @@ class YarpDriver(SerialAdapter[YarpOptions]):
                 Values(4, "<f4", VALUES_OF_A_FRAME),
                 patch=Bits(shift=4, width=4),
                 module=Bits(shift=0, width=4),
-                flags=_NO_NUMBER,
+                flags=NO_NUMBER,
                 time=time,
             )
             for name, kind, time in (("plain", PLAIN, None), ("timed", TIMED, DeviceTime(0, "<u4", 1e-3)))

@@ -137,7 +137,7 @@ def _next_in_arbitration(queue: deque[Transmission]) -> int:
     identifier = transmission.identifiers[transmission.sent]
     if identifier & _EXTENDED_FLAG:
         return (identifier & 0x1FFF_FFFF) << 1 | 1
-    return identifier << 19
+    return (identifier & 0x7FF) << 19
 
 
 class ForeignTraffic:

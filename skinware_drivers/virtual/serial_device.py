@@ -12,6 +12,8 @@ from skinware.errors import ConfigurationError
 from skinware_drivers.virtual.device import Device, EmulatorOptions
 from skinware_drivers.virtual.emulator import CanFrame, Emulator
 
+_ANSWER = 1 << 11
+"""Identifier of messages besides the data, which have 0: lines have no identifiers."""
 _HEARD = "heard"  # in the memory of a device: the beginning of a command, and when it came
 _LONGEST_PAUSE_NS = 200_000_000
 """Longest pause within a command. An older beginning is forgotten: its host has gone, or meant another device."""
@@ -74,11 +76,11 @@ class SerialEmulator(Emulator[OptionsT]):
 
     def say(self, device: Device, message: bytes, now_ns: int) -> None:
         """Send a message besides the data."""
-        self.reply(device, (0, message), now_ns)
+        self.reply(device, (_ANSWER, message), now_ns)
 
     def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Name the kind of a message; by default all are ``data``."""
-        return "data"
+        """Name the kind of a message, by default ``data`` or ``answer``: those of ``say`` have an identifier."""
+        return "answer" if identifier else "data"
 
     def kinds(self) -> Sequence[str]:
         """Name the kinds of messages with data: those of a burst, or ``data`` of devices that only answer."""

@@ -73,9 +73,8 @@ class EmulatedAgni(SerialEmulator[EmulatedAgniOptions]):
             at += count
         return sent
 
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        """Return ``sensor1`` and so on; other messages are answers."""
-        return f"sensor{payload[2]}" if 1 <= payload[2] <= len(self._counts) else "answer"
+    def kind_of(self, identifier: int, payload: bytes) -> str:
+        return super().kind_of(identifier, payload) if identifier else f"sensor{payload[2]}"
 
     def answer(self, device: Device, command: bytes, now_ns: int) -> bytes:
         target, number = command[2:4]

@@ -62,9 +62,6 @@ class EmulatedDev001(SerialEmulator[EmulatedDev001Options]):
     def kinds(self) -> Sequence[str]:
         return [f"port{port}" for port in self.options.ports]
 
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        return "records" if len(payload) > 3 and payload[0] < 5 and payload[1:4] == bytes(3) else "answer"
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         contents = device.memory.get("contents", _ALL)
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000

@@ -99,11 +99,6 @@ class EmulatedPaxini(SerialEmulator[EmulatedPaxiniOptions]):
             return self._answer_of_hand(device, command, now_ns)
         return self._answer_of_sensor(device, command, now_ns)
 
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        if self.options.board == "high_speed":
-            return "data" if payload[:2] == b"\xaa\x56" else "answer"
-        return "data" if payload[6] == 0xFB and 1008 <= struct.unpack_from("<I", payload, 7)[0] < 6100 else "answer"
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         felt = np.array(values).reshape(-1, 3)
         felt[:, 2] &= 0xFF

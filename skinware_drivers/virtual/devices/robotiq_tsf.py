@@ -68,9 +68,6 @@ class EmulatedRobotiqTsf(SerialEmulator[EmulatedRobotiqTsfOptions]):
     def kinds(self) -> Sequence[str]:
         return [f"{name}{finger}" for finger in self.numbers for name in _FIELDS]
 
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        return "packet"
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         data = b""
         for name, (kind, first, count) in _FIELDS.items():

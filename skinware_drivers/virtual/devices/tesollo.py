@@ -69,9 +69,6 @@ class EmulatedTesollo(SerialEmulator[EmulatedTesolloOptions]):
             return b""
         return None
 
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        return "data" if payload[2] == 1 else "answer"
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         motors, _ = _MOTORS_AND_FINGERS[self.options.hand]
         body = b""

@@ -85,9 +85,6 @@ class EmulatedWeissWts(SerialEmulator[EmulatedWeissWtsOptions]):
             return b""
         return message(command[3], struct.pack("<H", status) + answer)
 
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        return "answer" if payload[3] else "data"
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         """Return one message with all cells, without run lengths."""
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000
@@ -170,9 +167,6 @@ class EmulatedWeissDsa(SerialEmulator[EmulatedWeissDsaOptions]):
                 self.burst(device, now_ns)  # a single frame, as the maker's program asks for it
             return b""
         return None
-
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        return "answer" if payload[3] else "data"
 
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         uptime_ms = (device.sampled_ns - device.ready_ns) // 1_000_000 & 0xFFFF_FFFF

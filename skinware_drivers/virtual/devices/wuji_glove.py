@@ -55,9 +55,6 @@ class EmulatedWujiGlove(SerialEmulator[EmulatedWujiGloveOptions]):
         status, answer = self._do(device, command, now_ns)
         return message(0x57, command[4:8] + bytes([status]) + answer)
 
-    def kind_of(self, identifier: int, payload: bytes) -> str:  # noqa: ARG002
-        return "data" if payload[1] == 0x55 else "answer"
-
     def messages(self, device: Device, values: Sequence[int]) -> Sequence[bytes]:
         cells = [math.nan if at in self.options.invalid else value / 4096 for at, value in enumerate(values)]
         sent = device.memory["sent"] = device.memory.get("sent", -1) + 1

@@ -10,15 +10,14 @@ values: after any error a message counts only if it ends with 0D 0A and the 82 b
 
 from __future__ import annotations
 
-import math
 from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
 
 from skinware.sensor_types import MAGNETIC_FIELD_X, MAGNETIC_FIELD_Y, MAGNETIC_FIELD_Z, TEMPERATURE
-from skinware.status import Status
-from skinware_drivers import Frame, Layout, Module, Options, Patch, Sentinel, Values, taxels
+from skinware_drivers import Frame, Layout, Module, Options, Patch, Values, taxels
+from skinware_drivers.fields import NO_NUMBER
 from skinware_drivers.serial import Packet, SerialAdapter
 
 
@@ -44,8 +43,7 @@ class AnySkinDriver(SerialAdapter[AnySkinOptions]):
         super().__init__(options)
         size = 16 * options.mags
         self.framing = Packet(length=size + 2, trailer=b"\r\n", confirmed=True)
-        no_number = tuple(Sentinel(Status.SUSPECT, value) for value in (math.nan, math.inf, -math.inf))
         values = Values(offset=0, dtype="<f4", count=4 * options.mags)
-        self.layout = Layout((Frame("message", (), (size,), values, flags=no_number),))
+        self.layout = Layout((Frame("message", (), (size,), values, flags=NO_NUMBER),))
         channels = taxels(options.mags, *(t.name for t in self.types))
         self.patches = (Patch("anyskin", (Module(channels, kind="board"),)),)

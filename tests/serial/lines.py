@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import select
 import threading
 import tty
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +20,16 @@ from skinware_drivers.fields import Identifier, Match
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.options import NoOptions
-from skinware_drivers.running.generation import FlowLoop
 from skinware_drivers.running.runner import Runner
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.checksums import CRC16_XMODEM
 from skinware_drivers.serial.delimited import COBS, Delimited
 from skinware_drivers.serial.framing import Field, Framing
+from skinware_drivers.testing.driving import driving_lines
 from skinware_drivers.testing.waiting import wait_until
 
 FRAMING = Delimited(COBS, maximum_body=64, checksum=CRC16_XMODEM, identifier=Field(0))
-LOOP: Callable[[], asyncio.AbstractEventLoop] = FlowLoop
-"""Of drivers that run here."""
 DATA, ASK, ANSWER = 1, 0x10, 0x11
 N_TAXELS = 12
 
@@ -85,11 +82,9 @@ def opened(path: str, framing: Framing = FRAMING, **more: Any) -> Iterator[Seria
     """An open bus on a port."""
     bus = SerialBus(path, more.pop("options", None), payload_size=64, **more)
     bus.use(framing)
-    bus.open()
-    try:
+    with closing(bus):
+        bus.open()
         yield bus
-    finally:
-        bus.close()
 
 
 def is_readable(bus: SerialBus, timeout_s: float = 0.0) -> bool:
@@ -141,12 +136,12 @@ class Device(threading.Thread):
         self._line = where
         self._says = b"I am " + name.encode()
         self._flood = flood
-        self._ending = threading.Event()
+        self.ending = threading.Event()
         self.value = 0
 
     def run(self) -> None:
         heard = b""
-        while not self._ending.wait(0 if self._flood else 0.005):
+        while not self.ending.wait(0 if self._flood else 0.005):
             try:
                 if select.select([self._line.master], [], [], 0)[0]:
                     heard += os.read(self._line.master, 4096)
@@ -156,12 +151,7 @@ class Device(threading.Thread):
                 self.value += 1
                 os.write(self._line.master, self._flood or data_frame(self.value & 0xFFFF))
             except BlockingIOError:
-                self._ending.wait(0.001)
-
-    def stop(self) -> None:
-        self._ending.set()
-        self.join(30)
-        assert not self.is_alive()
+                self.ending.wait(0.001)
 
 
 @contextmanager
@@ -171,45 +161,20 @@ def device(where: Line, name: str = "tip1", flood: bytes = b"") -> Iterator[Devi
     try:
         yield running
     finally:
-        running.stop()
+        running.ending.set()
+        running.join(30)
+        assert not running.is_alive()
 
 
 @contextmanager
 def driving(*ports: str) -> Iterator[Runner]:
     """A driver of some ports, in a thread."""
-    buses = [SerialBus(port, payload_size=64) for port in ports]
-    made: list[Runner] = []
-    failures: list[BaseException] = []
-    loops: list[asyncio.AbstractEventLoop] = []
-    started = threading.Event()
-
-    async def run() -> None:
-        loops.append(asyncio.get_running_loop())
-        lines = [(f"line{i}", FingertipDriver(NoOptions()), bus) for i, bus in enumerate(buses)]
-        made.append(Runner("fingertip", lines, name="fingertip", slots=64))
-        started.set()
-        await made[0].run()
-
-    def work() -> None:
-        try:
-            with asyncio.Runner(loop_factory=LOOP) as loop:
-                loop.run(run())
-        except BaseException as error:  # noqa: BLE001  (shown to the test)
-            failures.append(error)
-            started.set()
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        assert started.wait(30)
-        yield made[0]
-    finally:
-        if thread.is_alive() and made:
-            loops[0].call_soon_threadsafe(made[0].stop)
-        thread.join(30)
-        assert not thread.is_alive(), "the driver did not stop"
-        if failures:
-            raise failures[0]
+    lines = [(FingertipDriver(NoOptions()), SerialBus(port, payload_size=64)) for port in ports]
+    names = [f"line{number}" for number in range(len(ports))]
+    with driving_lines(lines, "fingertip", wait=False, bus_names=names) as running:
+        wait_until(lambda: running.runner is not None)
+        assert running.runner is not None
+        yield running.runner
 
 
 class Usb:

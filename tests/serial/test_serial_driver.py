@@ -26,7 +26,6 @@ from skinware_drivers.serial.checksums import XOR
 from skinware_drivers.serial.packets import LengthTable, Packet
 from skinware_drivers.testing.waiting import wait_until
 from tests.sdk.driving import read_until
-from tests.serial import lines
 from tests.serial.lines import (
     ANSWER,
     ASK,
@@ -44,7 +43,7 @@ from tests.serial.lines import (
 @pytest.fixture(autouse=True, params=[FlowLoop, asyncio.SelectorEventLoop])
 def loop(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Which event loop drivers run in: one in whose rests C reads lines, or another."""
-    monkeypatch.setattr(lines, "LOOP", request.param)
+    monkeypatch.setattr("skinware_drivers.testing.driving.FlowLoop", request.param)
 
 
 def fresh(frame: DriverSnapshot, tip: int) -> bool:

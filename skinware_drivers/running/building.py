@@ -15,13 +15,13 @@ from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
 from skinware.realtime import NS_PER_S
-from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types, uid_on_bus
 from skinware_drivers.layout import Layout
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation, latency_for, make_watch
 from skinware_drivers.running.guard import Ending, hook
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher, RequestDesk, offered
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, Publisher, RequestDesk, offered
 
 log: logging.Logger = logging.getLogger("skinware.driver")
 
@@ -141,7 +141,7 @@ class Builder:
             tables.structure,
             driver_type=identity.driver_type,
             bus_counters=ALL_BUS_COUNTERS,
-            patch_counters=ALL_PATCH_COUNTERS,
+            patch_counters=PATCH_COUNTERS,
             namespace=identity.namespace,
             slots=identity.slots,
             rate_hz=1 / self._period_s,

@@ -21,7 +21,7 @@ from skinware.status import LOAD_UNKNOWN, SAMPLE, SAMPLES, BusState, DataPath, P
 from skinware.structure import Structure
 from skinware.text import nearest_name
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
-from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS, Decoder, SkinState, Updates
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, Decoder, SkinState, Updates
 from skinware_drivers.description import Patch
 from skinware_drivers.operations import Operation, check_arguments, operations_of
 from skinware_drivers.polling import Watch
@@ -32,7 +32,6 @@ log: logging.Logger = logging.getLogger("skinware.driver")
 
 ALL_BUS_COUNTERS = (*OWN_BUS_COUNTERS, *BUS_COUNTERS)
 """Counters of every bus, in the order of the column ``bus_counters``."""
-ALL_PATCH_COUNTERS = PATCH_COUNTERS
 
 _IDLE_NS = NS_PER_S // 4
 NEVER_NS = (1 << 63) - 1

@@ -14,12 +14,13 @@ from skinware.realtime import now_ns, short_turns
 from skinware.status import DataPath, PatchState, load_report, sample_report
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.running.building import Builder, Identity, PublishMode
 from skinware_drivers.running.bus_line import BusLine, open_buses
 from skinware_drivers.running.data_loop import DataLoop
 from skinware_drivers.running.guard import Ending
 from skinware_drivers.running.news import PatchChange
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS
 from skinware_drivers.running.serving import BusChanges, Serving
 from skinware_drivers.running.wires import Wires
 
@@ -164,7 +165,7 @@ class Runner:
         patches = []
         for patch in range(structure.n_patches):
             last_ns = int(state.patch_time_ns[patch])
-            counters = dict(zip(ALL_PATCH_COUNTERS, state.patch_counters[patch].tolist(), strict=True))
+            counters = dict(zip(PATCH_COUNTERS, state.patch_counters[patch].tolist(), strict=True))
             patches.append(
                 {
                     "name": generation.name_of(patch),

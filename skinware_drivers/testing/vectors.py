@@ -33,7 +33,7 @@ from skinware.structure import Structure
 from skinware_drivers.adapter import Adapter, AnyAdapter
 from skinware_drivers.bus import FrameBatch, check_identifier, identifier_text
 from skinware_drivers.counters import BusCounters
-from skinware_drivers.decoding.decoder import BUS_COUNTERS, Decoder
+from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble
 from skinware_drivers.finding.without_driver import attended
 from skinware_drivers.layout import Layout
@@ -41,7 +41,7 @@ from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.master import Listener
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import Named, NativePath
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.testing.waiting import defect, require, run_in_its_time
 from skinware_drivers.testing.wire import make_bus
@@ -114,7 +114,7 @@ class DirectPath:
             "direct",
             self.decoder.tables.structure,
             bus_counters=ALL_BUS_COUNTERS,
-            patch_counters=ALL_PATCH_COUNTERS,
+            patch_counters=PATCH_COUNTERS,
             namespace=self._namespace,
         )
         publisher = Publisher(self._writer, self.decoder, watch or Watch(tables), 1.0, by_cycle=False)

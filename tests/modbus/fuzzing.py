@@ -23,7 +23,7 @@ from skinware.sensor_types import PRESSURE
 from skinware_drivers import Module, NoOptions, Patch, native, taxels
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import OWN_BUS_COUNTERS, BusCounters, read_own
-from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS, Decoder
 from skinware_drivers.description import assemble
 from skinware_drivers.modbus import ModbusAdapter, Registers, wire
 from skinware_drivers.modbus.bus import ModbusBus
@@ -32,7 +32,7 @@ from skinware_drivers.modbus.registers import Wanted
 from skinware_drivers.modbus.wire import Message
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Flow, Generation
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, Publisher
 from skinware_drivers.serial.ports import DescriptorPort, Port
 from skinware_drivers.virtual.hand_clock import HandClock
 from tests.serial.fuzzing import Script
@@ -142,7 +142,7 @@ class _InC(_InPython):
             "fingers",
             decoder.tables.structure,
             bus_counters=ALL_BUS_COUNTERS,
-            patch_counters=ALL_PATCH_COUNTERS,
+            patch_counters=PATCH_COUNTERS,
         )
         stack.callback(writer.close)
         publisher = Publisher(writer, decoder, adapter.watch(tables), adapter.period_s, by_cycle=True)

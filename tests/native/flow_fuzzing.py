@@ -27,7 +27,7 @@ from skinware_drivers.bus import Bus, is_read_natively
 from skinware_drivers.can import CanAdapter
 from skinware_drivers.can.socketcan import SocketCanBus
 from skinware_drivers.counters import read_own
-from skinware_drivers.decoding.decoder import Decoder
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS, Decoder
 from skinware_drivers.description import assemble, join_types
 from skinware_drivers.fields import Match
 from skinware_drivers.layout import Frame
@@ -35,7 +35,7 @@ from skinware_drivers.options import NoOptions
 from skinware_drivers.registry import load_driver
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Flow, Generation
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, Publisher
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, Publisher
 from skinware_drivers.serial.adapter import SerialAdapter
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.serial.ports import DescriptorPort, Port
@@ -297,7 +297,7 @@ class _Fuzz:
         )
         decoder = Decoder([adapter.layout for adapter in adapters], tables, [a.period_s for a in adapters])
         writer = DriverWriter(
-            "flow", decoder.tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS
+            "flow", decoder.tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=PATCH_COUNTERS
         )
         self._stack.callback(writer.close)
         watch, period_s = adapters[0].watch(tables), adapters[0].period_s

@@ -7,9 +7,10 @@ import pytest
 
 from skinware import DriverReader, DriverWriter, PatchState, Status
 from skinware_drivers.counters import BusCounters
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.polling import Watch
 from skinware_drivers.running import publisher as publisher_module
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS
 from tests.sdk.test_roboskin_wire import MS, Rig, Wire, halves
 from tests.specification import publishing
 from tests.specification.publishing import SpecifiedPublisher
@@ -39,7 +40,7 @@ class Desk:
         self.rig = Rig(boards=boards)
         tables = self.rig.decoder.tables
         self.writer = DriverWriter(
-            "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=ALL_PATCH_COUNTERS, slots=slots
+            "desk", tables.structure, bus_counters=ALL_BUS_COUNTERS, patch_counters=PATCH_COUNTERS, slots=slots
         )
         self.watch = self.rig.driver.watch(tables) if watched else Watch(tables)
         self.publisher = SpecifiedPublisher(self.writer, self.rig.decoder, self.watch, PERIOD_S, True)

@@ -14,12 +14,12 @@ from skinware.memory.namespace import Namespace
 from skinware.status import Status
 from skinware_drivers.bus import FrameBatch
 from skinware_drivers.counters import BusCounters, read_own
-from skinware_drivers.decoding.decoder import Decoder, Updates
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS, Decoder, Updates
 from skinware_drivers.description import SkinTables
 from skinware_drivers.layout import Layout
 from skinware_drivers.polling import Watch
 from skinware_drivers.running.native_path import NativePath
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS, NEVER_NS, Publisher, RequestDesk
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, NEVER_NS, Publisher, RequestDesk
 from skinware_drivers.testing.waiting import defect
 from tests.specification.decoding import SpecifiedDecoder
 from tests.specification.publishing import SpecifiedPublisher
@@ -130,7 +130,7 @@ class Way:
             name,
             self.decoder.tables.structure,
             bus_counters=ALL_BUS_COUNTERS,
-            patch_counters=ALL_PATCH_COUNTERS,
+            patch_counters=PATCH_COUNTERS,
             slots=publishing.slots,
             namespace=namespace,
         )

@@ -36,11 +36,12 @@ from skinware_drivers.bus import FrameBatch
 from skinware_drivers.can.roboskin import RoboskinDriver
 from skinware_drivers.can.roboskin_layout import RoboskinOptions
 from skinware_drivers.can.socketcan import SocketCanBus
+from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import assemble
 from skinware_drivers.native import structs
 from skinware_drivers.native.compiling import compile_batch
 from skinware_drivers.running.native_path import NativePath
-from skinware_drivers.running.publisher import ALL_BUS_COUNTERS, ALL_PATCH_COUNTERS
+from skinware_drivers.running.publisher import ALL_BUS_COUNTERS
 from tests.specification.decoding import SpecifiedDecoder
 from tests.specification.publishing import SpecifiedPublisher
 
@@ -87,7 +88,7 @@ class Numpy:
             tables.structure,
             namespace=namespace,
             bus_counters=ALL_BUS_COUNTERS,
-            patch_counters=ALL_PATCH_COUNTERS,
+            patch_counters=PATCH_COUNTERS,
         )
         self.publisher = SpecifiedPublisher(
             self.writer, self.decoder, driver.watch(tables), driver.period_s, driver.by_cycle

@@ -14,10 +14,11 @@ from skinware.driver_service import DriverWriter
 from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.memory.namespace import Namespace
-from skinware.realtime import NS_PER_S
+from skinware.realtime import NS_PER_S, now_ns
 from skinware_drivers.decoding.decoder import PATCH_COUNTERS, Decoder
 from skinware_drivers.description import Patch, SkinTables, assemble, join_types, uid_on_bus
 from skinware_drivers.layout import Layout
+from skinware_drivers.operations import Operation
 from skinware_drivers.running.bus_line import BusLine
 from skinware_drivers.running.generation import Generation, latency_for, make_watch
 from skinware_drivers.running.guard import Ending, hook
@@ -165,15 +166,17 @@ class Builder:
     def _period_s(self) -> float:
         return max(self._periods_s)
 
-    def _after_operation(self, line: BusLine, patches: Sequence[Patch], set_up: bool) -> None:
+    def _after_operation(self, line: BusLine, patches: Sequence[Patch], operation: Operation) -> None:
         generation = self.generation
         if generation is None:
             return
         if self._period_s != generation.period_s or self._layouts != generation.decoder.compiled.layouts:
             self._change_to(generation.decoder.compiled.described)
-        elif set_up:
-            for number in (generation.number_of(line, patch) for patch in patches):
-                if number is not None:
+            return
+        for patch in () if operation.looks else patches:
+            if (number := generation.number_of(line, patch)) is not None:
+                generation.publisher.patches.counts_from_ns[number] = now_ns()
+                if operation.sets_up:
                     with hook("Watch.forget", line.name):
                         generation.watch.forget(number)
 

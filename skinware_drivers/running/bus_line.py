@@ -107,7 +107,6 @@ class BusLine:
         suspects: keys of the patches that report errors.
         started: its devices may have begun to send.
         set_up_ns: when all of it was last set up, CLOCK_MONOTONIC ns.
-        revived_ns: when one of its patches was last set up again.
         needs_care: set when it was lost, or a patch on it does not deliver.
         busy: held while its devices are being set up or asked to do something, and may be silent for it.
     """
@@ -123,7 +122,6 @@ class BusLine:
         self.suspects: set[int] = set()
         self.started: bool = False
         self.set_up_ns = 0
-        self.revived_ns = 0
         self.needs_care: asyncio.Event = asyncio.Event()
         self.busy: asyncio.Lock = asyncio.Lock()
 

@@ -130,13 +130,11 @@ class PatchCare:
         line, generation = self._line, self._generation()
         if generation is None or self._listen_only or line.connection.lost.is_set() or line.busy.locked():
             return
-        silence_ns = generation.publisher.pace.silence_ns
-        if now_ns() - max(line.connection.opened_ns, generation.begun_ns) < 2 * silence_ns:
+        begun_ns = max(line.connection.opened_ns, generation.begun_ns)
+        if now_ns() - begun_ns < 2 * generation.publisher.pace.silence_ns:
             return  # unheard boards may send: to set them up again would move their baseline
-        states = [PatchState.STALE, PatchState.EXPECTED]
-        if now_ns() - line.revived_ns > 2 * silence_ns:  # set up again, without data since
-            states.append(PatchState.RESTARTED)
-        silent, asked_ns = self._surely_silent(generation.patches_in(line, *states)), now_ns()
+        not_heard = generation.patches_in(line, PatchState.STALE, PatchState.EXPECTED, PatchState.RESTARTED)
+        silent, asked_ns = self._surely_silent(not_heard), now_ns()
         if self._knows_only_all:
             is_due = self._set_ups_of_all.is_due or not self._patches_in(PatchState.LIVE)
             if not silent:
@@ -155,12 +153,9 @@ class PatchCare:
         line, generation = self._line, self._generation()
         if generation is None:
             return []
-        numbers = [generation.number_of(line, patch) for patch in patches]
-        return [
-            patch
-            for patch, number in zip(patches, numbers, strict=True)
-            if number is not None and generation.publisher.silent_ns(number) >= _SURE_NS
-        ]
+        silent_ns = generation.publisher.silent_ns
+        found = [(patch, generation.number_of(line, patch)) for patch in patches]
+        return [patch for patch, number in found if number is not None and silent_ns(number) >= _SURE_NS]
 
     async def _is_to_be_set_up(self, patch: Patch) -> bool:
         line, set_ups = self._line, self._set_ups.get(patch.key)
@@ -257,7 +252,6 @@ class PatchCare:
                 try:
                     with hook("revive", line.name):
                         await line.adapter.revive(line.link, patch)
-                    line.revived_ns = now_ns()
                 except BusError as error:
                     self._error = str(error) or type(error).__name__
             generation = self._generation()  # it may be another one by now
@@ -268,6 +262,7 @@ class PatchCare:
                 log.debug("%s: %s", line.name, self._error)
                 generation.publisher.lose(number, PatchState.STALE)
             else:
+                generation.publisher.patches.counts_from_ns[number] = now_ns()
                 line.suspects.discard(patch.key)
                 with hook("Watch.forget", line.name):
                     generation.watch.forget(number)

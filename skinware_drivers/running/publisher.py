@@ -85,6 +85,7 @@ class PatchLife:
         state: :class:`skinware.PatchState`.
         heard_ns: when the last update came.
         lives_until_ns: when it becomes silent, unless a whole update comes before.
+        counts_from_ns: its silence does not count before: it was set up, or asked for something, until then.
         pause_ns: the pause that ends a burst.
         standing_out_ns: the shortest pause that is longer than the spacing of modules.
         group_heard_ns: (n_groups,), when the last update of each group came.
@@ -97,6 +98,7 @@ class PatchLife:
         self.state: npt.NDArray[np.uint8] = np.full(n_patches, int(PatchState.EXPECTED), np.uint8)
         self.heard_ns = np.zeros(n_patches, np.int64)
         self.lives_until_ns = np.zeros(n_patches, np.int64)
+        self.counts_from_ns = np.zeros(n_patches, np.int64)
         self.pause_ns: npt.NDArray[np.int64] = np.full(n_patches, pace.pause_ns, np.int64)
         n_prompt = np.bincount(state.group_patch[state.is_prompt], minlength=n_patches)
         self.standing_out_ns: npt.NDArray[np.float64] = _STANDS_OUT * pace.period_ns / np.maximum(1, n_prompt)
@@ -172,17 +174,18 @@ class Publisher:
             self._desk.published(oldest_ns, self.writer.position)
 
     def lose(self, patch: int, state: PatchState) -> None:
-        """Count a patch as silent from now on, until its next data."""
+        """Count a patch as silent until its next data."""
         self.patches.lives_until_ns[patch] = 0
         self.patches.state[patch] = state
 
     def excuse(self, since_ns: int, asleep_ns: int) -> None:
-        """Count silence from now on, for patches that lived when this process last ran.
+        """Count silence only while this process ran; from now on for patches that lived when it last ran.
 
         Args:
             asleep_ns: how long the machine was suspended: older data is older by that time.
         """
-        lives_until_ns = self.patches.lives_until_ns
+        lives_until_ns, counts_from_ns = self.patches.lives_until_ns, self.patches.counts_from_ns
+        counts_from_ns[:] = np.maximum(lives_until_ns, counts_from_ns) + (now_ns() - since_ns)
         lived = lives_until_ns > since_ns
         until_ns = np.maximum(lives_until_ns, now_ns() + self.pace.silence_ns)
         lives_until_ns[lived] = until_ns[lived]
@@ -191,7 +194,7 @@ class Publisher:
 
     def silent_ns(self, patch: int) -> int:
         """Return how long a patch has been silent beyond its age limit, while this process ran, ns."""
-        return now_ns() - int(self.patches.lives_until_ns[patch])
+        return now_ns() - int(max(self.patches.lives_until_ns[patch], self.patches.counts_from_ns[patch]))
 
     def count_buses(self) -> npt.NDArray[np.int64]:
         """Return (n_buses, len(ALL_BUS_COUNTERS)) int64, as of now."""
@@ -216,7 +219,7 @@ class RequestDesk:
     """Carries out operations on the buses, and answers requests for new snapshots.
 
     Args:
-        changed: called after an operation with its bus, its patches, and whether it set them up again.
+        changed: called after an operation with its bus and its patches.
         ending: of the driver; errors outside of an operation end it.
     """
 
@@ -225,7 +228,7 @@ class RequestDesk:
         server: RequestServer,
         lines: Sequence[BusLine],
         listen_only: bool,
-        changed: Callable[[BusLine, Sequence[Patch], bool], object],
+        changed: Callable[[BusLine, Sequence[Patch], Operation], object],
         ending: Ending,
     ) -> None:
         self._server = server
@@ -319,7 +322,7 @@ class RequestDesk:
                     log.warning("%s", str(error))
                 raise error.__cause__ if isinstance(error.__cause__, Exception) else error from None
         try:
-            self._changed(line, patches, operation.sets_up)
+            self._changed(line, patches, operation)
         except Exception as error:
             self._ending.fail(error)
             raise

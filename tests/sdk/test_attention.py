@@ -69,6 +69,24 @@ def test_patches_that_lived_are_excused_and_values_of_before_are_old(monkeypatch
     desk.close()
 
 
+def test_silence_counts_only_while_this_process_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    desk = Desk(monkeypatch)
+    desk.feed(desk.burst(1))
+    desk.clock.now_ns += 60 * NS_PER_S
+    desk.publisher.patches.counts_from_ns[0] = desk.clock.now_ns
+    assert desk.publisher.silent_ns(0) == 0
+    desk.clock.now_ns += 40 * MS
+    ran_ns = desk.clock.now_ns
+    for _ in range(3):  # held up again and again
+        desk.clock.now_ns += 5 * NS_PER_S
+        desk.publisher.excuse(ran_ns, 0)
+        ran_ns = desk.clock.now_ns
+    assert desk.publisher.silent_ns(0) == 40 * MS
+    desk.publisher.publish_if_due(desk.clock.now_ns)
+    assert desk.reader.read().patch_state.tolist() == [PatchState.STALE]
+    desk.close()
+
+
 def test_what_was_heard_before_the_machine_slept_is_not_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
     desk = Desk(monkeypatch)
     desk.feed(desk.burst(1))

@@ -18,6 +18,7 @@ from skinware_drivers.link import Link
 from skinware_drivers.loading import registered
 from skinware_drivers.operations import operation, operations_of
 from skinware_drivers.registry import DRIVERS, load_driver
+from skinware_drivers.running.data_loop import Attention
 from skinware_drivers.testing.waiting import wait_until
 from skinware_drivers.virtual.hardware import Event
 from tests.sdk.driving import commands, driving, emulated, hardware_of, read_until
@@ -79,6 +80,18 @@ def test_disabled_boards_stay_silent_until_they_are_enabled() -> None:
         reader.call("enable", patch="board 7")
         read_until(reader, lambda f: f.patch_state[0] == PatchState.LIVE and not f.status.any())
         assert told(log, before) == [(0x207, "0701"), (0x207, "0700")]
+
+
+def test_silence_counts_from_the_end_of_an_operation_that_changes_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A board that was enabled again is silent until it first sends: that must not look like a restart."""
+    monkeypatch.setattr(Attention, "look", lambda *_: None)  # a hold-up would move the times
+    with driving(emulated(boards=(7, 8))) as running, DriverReader("roboskin") as reader:
+        from_ns = running.runner.builder.generation.publisher.patches.counts_from_ns  # type: ignore[union-attr]
+        reader.call("versions")
+        assert from_ns.tolist() == [0, 0]
+        asked_ns = now_ns()
+        reader.call("enable", patch="board 8")
+        assert from_ns[0] == 0 < asked_ns < from_ns[1]
 
 
 def test_another_rate() -> None:

@@ -71,7 +71,10 @@ class Stage:
         generation = SimpleNamespace(
             begun_ns=0,
             publisher=SimpleNamespace(
-                pace=SimpleNamespace(silence_ns=0), lose=nothing, silent_ns=lambda _patch: 1 << 62
+                pace=SimpleNamespace(silence_ns=0),
+                lose=nothing,
+                silent_ns=lambda _patch: 1 << 62,
+                patches=SimpleNamespace(counts_from_ns=[0] * len(PATCHES)),
             ),
             decoder=SimpleNamespace(forget=self.forgotten.append),
             watch=SimpleNamespace(forget=nothing),
@@ -85,7 +88,6 @@ class Stage:
             connection=SimpleNamespace(lost=asyncio.Event(), opened_ns=0),
             condition=SimpleNamespace(limits=self),
             busy=asyncio.Lock(),
-            revived_ns=0,
             suspects=set(),
             set_up_ns=0,
         )

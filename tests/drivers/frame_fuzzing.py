@@ -117,6 +117,3 @@ def _fill(row: np.void, frame: Frame, adapter: AnyAdapter, key: int, right: floa
                 row["payload"][field.byte] = number << field.shift & 0xFF
             elif isinstance(field, Bits):
                 row["identifier"] |= number << field.shift & 0x7FF
-
-
-__all__ = ["Outcome", "fuzz"]

@@ -160,6 +160,3 @@ def _flat(path: Path, element: ET.Element) -> tuple[dict[str, str], dict[str, di
 
 def _numbers(text: str) -> list[int]:
     return [int(word, 0) for word in text.replace('"', " ").split()]
-
-
-__all__ = ["Board", "Device", "board_after", "devices", "places", "ports"]

@@ -174,6 +174,3 @@ class _Hostile:
         elif kind == "noise":
             frame[:0] = random.bytes(int(random.integers(1, 40)))
         return bytes(frame)
-
-
-__all__ = ["FUZZED", "fuzz"]

@@ -54,6 +54,3 @@ def use_library() -> None:
         from skinware_drivers import native
 
         native._FILE = Path(os.environ[LIBRARY])
-
-
-__all__ = ["COMPILER", "LIBRARY", "compile_sanitized", "environment", "use_library"]

@@ -257,20 +257,4 @@ def driving(
         yield running
 
 
-__all__ = [
-    "Chatter",
-    "Driving",
-    "EveryFrame",
-    "LateBoards",
-    "Together",
-    "TroubledBus",
-    "commands",
-    "driving",
-    "driving_lines",
-    "emulated",
-    "follow",
-    "hardware_of",
-    "read_until",
-    "restarted_on_demand",
-    "troubled",
-]
+__all__ = ["Driving", "driving_lines", "read_until"]

@@ -172,6 +172,3 @@ class QTouch:
 
 def _nothing(n: int) -> Judged:
     return np.zeros(n, bool), np.zeros(n, np.float32)
-
-
-__all__ = ["CapSense", "ICub", "Judged", "QTouch", "Rule", "TareOnce"]

@@ -258,12 +258,12 @@ class DataLoop:
         generation = self._generation
         if generation is None:
             return
+        if not generation.flows:
+            self._intake.take()  # what has arrived comes first: this may be late
         self._attend(generation)
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if not generation.flows:
-            self._intake.take()  # what has arrived comes first: this may be late
         generation.publisher.writer.keep_files()
         self.machine.look()
         generation.update_bus_states()

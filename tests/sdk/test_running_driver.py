@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import time
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -212,6 +214,29 @@ def test_a_restarted_board_is_set_up_alone() -> None:
         sent = {(i, p.replace(" ", "").lower()) for _, i, p in commands(log)[before:]}
     assert {identifier for identifier, payload in sent if not payload.startswith("0701")} == {0x208}
     assert {"4d0032f0", "50000f02010022", "0700"} <= {payload for _, payload in sent}
+
+
+@pytest.mark.usefixtures("hurry")
+def test_a_hold_up_while_a_snapshot_is_due_silences_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    bus = emulated(boards=(7,))
+    with caplog.at_level(logging.WARNING), driving(bus) as running, DriverReader("roboskin") as reader:
+        frame = read_until(reader, lambda f: not f.status.any())
+        receive, data = bus.receive, running.runner._data  # type: ignore[union-attr]
+
+        def held_up(*arguments: Any) -> int:
+            bus.receive = receive  # type: ignore[method-assign]
+            time.sleep(1.2)
+            return receive(*arguments)
+
+        def publish() -> None:
+            select.select([bus.fileno()], [], [])
+            bus.receive = held_up  # type: ignore[assignment,method-assign]
+            data._publish_when_due()
+
+        running.do(publish)
+        read_until(reader, lambda f: f.sequence > frame.sequence + 20 and not f.status.any())
+    assert "nothing is heard" not in caplog.text
+    assert "silent" not in caplog.text.replace("silence is counted", "")
 
 
 @pytest.mark.usefixtures("hurry")

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from importlib import import_module
-
-_INTERRUPTED = 130
 
 
 def _end(_number: int, _frame: object) -> None:
-    os._exit(_INTERRUPTED)  # the interpreter would print where the import stopped
+    os._exit(128 + signal.SIGINT)  # the interpreter would print where the import stopped
 
 
 class _Function:
@@ -29,6 +28,9 @@ class _Function:
         before = signal.getsignal(signal.SIGINT)
         if before is signal.default_int_handler:
             signal.signal(signal.SIGINT, _end)
+        for stream, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+            if getattr(sys, stream) is None:  # started with it closed: another file would get its descriptor
+                setattr(sys, stream, open(os.devnull, mode))  # noqa: SIM115
         module, _, name = self._path.rpartition(".")
         function = getattr(import_module(module), name)
         signal.signal(signal.SIGINT, before)

@@ -263,8 +263,7 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
         color = False if os.environ.get("NO_COLOR") else None  # None: colours on a terminal
         with command.make_context(name, list(arguments), color=color) as context:
             command.invoke(context)
-        if sys.stdout is not None:  # None: started with stdout closed
-            sys.stdout.flush()
+        sys.stdout.flush()
         return EXIT_DONE
     except (KeyboardInterrupt, click.Abort):
         return EXIT_DONE

@@ -159,10 +159,8 @@ def patient_output() -> Iterator[None]:
             err.end()
 
 
-def _patient(stream: TextIO | None) -> PatientStream | None:
+def _patient(stream: TextIO) -> PatientStream | None:
     """Return a patient stream for a stream with a file; None for others (those of tests)."""
-    if stream is None:
-        return None
     try:
         stream.flush()
         return PatientStream(stream)

@@ -1,4 +1,4 @@
-"""Ctrl-C while the modules of a command are imported."""
+"""Commands before their modules are imported: Ctrl-C, and streams that are closed."""
 
 from __future__ import annotations
 
@@ -31,3 +31,11 @@ def test_ctrl_c_before_a_command_runs_ends_it_in_silence(
     program = "import skinware_start; skinware_start._Function('interrupted.main')()"
     ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (status, printed, "")
+
+
+def test_closed_streams_lead_nowhere_and_keep_their_descriptors(tmp_path: Path) -> None:
+    check = "print(sys.stdin.read(), sys.stdout.isatty(), file=sys.stderr); sys.exit(open('other', 'w').fileno() < 3)"
+    (tmp_path / "closed.py").write_text(f"import sys\ndef main():\n    {check}\n")
+    program = "import skinware_start; skinware_start._Function('closed.main')()"
+    closing = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh"]
+    assert subprocess.run([*closing, sys.executable, "-c", program], cwd=tmp_path, check=False).returncode == 0

@@ -213,7 +213,7 @@ def command(
 
     FILE does not change; its damaged parts are left out and reported. The new file appears when it is complete.
     """
-    from skinware.conversion import Selection, convert, convert_wires
+    from skinware.conversion import Selection, convert
     from skinware.tactile.regions import SensorChoice
 
     if guess:
@@ -244,8 +244,7 @@ def command(
         elif format_name in _LEARNING_FORMATS:
             converted = _learning_set(file, output, selection, learning, time_and_end)
         else:
-            write = convert_wires if format_name in _WIRE_FORMATS else convert
-            converted = write(file, output, format_name, selection, **time_and_end)
+            converted = convert(file, output, format_name, selection, **time_and_end)
     for note in converted.notes:
         cli.warn(note)
     in_episodes = {"episodes": converted.episodes} if converted.episodes is not None else {}

@@ -6,7 +6,7 @@ time; each format writes these rows, in little memory.
 
 from __future__ import annotations
 
-from skinware.conversion.converting import FORMATS, WIRE_FORMATS, Converted, convert, convert_foreign, convert_wires
+from skinware.conversion.converting import FORMATS, WIRE_FORMATS, Converted, convert, convert_foreign
 from skinware.conversion.tables import Selection
 
-__all__ = ["FORMATS", "WIRE_FORMATS", "Converted", "Selection", "convert", "convert_foreign", "convert_wires"]
+__all__ = ["FORMATS", "WIRE_FORMATS", "Converted", "Selection", "convert", "convert_foreign"]

@@ -80,8 +80,8 @@ def convert(
     Args:
         path: a recording; it is only read.
         target: the new file or folder, which must not exist; None: beside the recording, with the format's suffix.
-        format_name: one of :data:`FORMATS`.
-        selection: the services and sensors to convert; None: all.
+        format_name: one of :data:`FORMATS`; or of :data:`WIRE_FORMATS`, for a recording of ``skin-record --wire``.
+        selection: the services and sensors to convert, of wires only the drivers; None: all.
         start_s: begin at this time, s since the recording began.
         end_s: end before this time; None: at the end of the recording.
         is_stopped: called now and then; True ends the conversion with :class:`KeyboardInterrupt` and leaves no file.
@@ -92,6 +92,11 @@ def convert(
         MissingExtra: a package of the extra ``convert`` is not installed.
         OSError: the recording cannot be read, or the target cannot be written.
     """
+    if format_name in WIRE_FORMATS:
+        drivers = () if selection is None else selection.services
+        if selection is not None and selection.sensors:
+            raise ConfigurationError(f"{format_name} holds frames of wires: select drivers, not sensors")
+        return _converted_wires(path, target, WIRE_FORMATS[format_name], Chosen(drivers, start_s, end_s, is_stopped))
     form = FORMATS[format_name]
     target = new_target(path, target, form.suffix)
     with contextlib.closing(RecordedSource(path, start_s, end_s, selection, is_stopped)) as source:
@@ -172,27 +177,8 @@ class WireFormat(NamedTuple):
 WIRE_FORMATS = {"candump": WireFormat(".log", export_candump), "pcapng": WireFormat(".pcapng", export_pcapng)}
 
 
-def convert_wires(
-    path: Path,
-    target: Path | None,
-    format_name: str,
-    selection: Selection | None = None,
-    *,
-    start_s: float = 0.0,
-    end_s: float | None = None,
-    is_stopped: Callable[[], bool] = lambda: False,
-) -> Converted:
-    """Write the recorded wires of drivers; the arguments and errors are those of :func:`convert`.
-
-    Args:
-        path: a recording that ``skin-record --wire`` made.
-        format_name: one of :data:`WIRE_FORMATS`.
-        selection: drivers; it selects no sensors, which a wire does not have.
-    """
-    form, selection = WIRE_FORMATS[format_name], selection or Selection()
-    if selection.sensors:
-        raise ConfigurationError(f"{format_name} holds frames of wires: select drivers, not sensors")
+def _converted_wires(path: Path, target: Path | None, form: WireFormat, chosen: Chosen) -> Converted:
     target = new_target(path, target, form.suffix)
     with contextlib.closing(Recording(path)) as recording, begun_beside(target) as begun:
-        exported = form.export(recording, begun, Chosen(selection.services, start_s, end_s, is_stopped))
+        exported = form.export(recording, begun, chosen)
         return Converted(target, exported.counts, [*recording.problems, *exported.notes])

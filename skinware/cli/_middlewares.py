@@ -126,9 +126,10 @@ def ros2(
             cli.echo_changes(shown, {name: driver.state for name, driver in drivers.items()})
 
     if rmw == "zenoh":
-        from skinware.ros2.rmw_zenoh import ROUTER, ZenohNode
+        from skinware.bridge.endpoints import DEFAULT_ROUTER
+        from skinware.ros2.rmw_zenoh import ZenohNode
 
-        node: Node = ZenohNode(identity, connect=connect or (ROUTER,), router_changed=report_router)
+        node: Node = ZenohNode(identity, connect=connect or (DEFAULT_ROUTER,), router_changed=report_router)
     else:
         from skinware.ros2.dds import DdsNode
 

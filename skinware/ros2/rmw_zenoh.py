@@ -25,7 +25,7 @@ from typing import Any
 import zenoh
 import zenoh.ext
 
-from skinware.bridge.endpoints import Endpoints, endpoints
+from skinware.bridge.endpoints import DEFAULT_ROUTER, Endpoints, endpoints
 from skinware.bridge.link import directly, open_session
 from skinware.errors import BridgeError, MissingExtra
 from skinware.ros2.transport import Cdr, Distro, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
@@ -35,8 +35,6 @@ if find_spec("xxhash") is None:
 
 import xxhash
 
-ROUTER = "tcp/127.0.0.1:7447"
-"""The router of a machine."""
 _LISTEN = "tcp/127.0.0.1:0"
 _SETTINGS = {
     "scouting/gossip/enabled": "true",
@@ -80,7 +78,7 @@ class ZenohNode:
         self,
         identity: NodeIdentity,
         *,
-        connect: Sequence[str] = (ROUTER,),
+        connect: Sequence[str] = (DEFAULT_ROUTER,),
         router_changed: Callable[[bool, str], None] = lambda _is_there, _line: None,
     ) -> None:
         places = graph_endpoints(connect)

@@ -25,8 +25,9 @@ from skinware_drivers.streams.dds import LONGEST, DdsTopic, TopicBus, TopicPort,
 if find_spec("zenoh") is None or find_spec("xxhash") is None:
     raise MissingExtra.of("a bus ros2", "skinware[ros2-zenoh]")
 
+from skinware.bridge.endpoints import DEFAULT_ROUTER
 from skinware.bridge.link import Link
-from skinware.ros2.rmw_zenoh import ROUTER, MessageAttachment, gid, graph_endpoints
+from skinware.ros2.rmw_zenoh import MessageAttachment, gid, graph_endpoints
 
 _TOKEN_PARTS, _MOST_TOKENS = 13, 8192
 _AT_ONCE = 64
@@ -35,7 +36,9 @@ _OVERTAKEN = 64
 
 
 class ZenohOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    router: Annotated[tuple[str, ...], Meta(description="routers of zenoh, as tcp/192.168.1.10:7447")] = (ROUTER,)
+    router: Annotated[tuple[str, ...], Meta(description="routers of zenoh, as tcp/192.168.1.10:7447")] = (
+        DEFAULT_ROUTER,
+    )
     depth: Annotated[
         int, Meta(ge=1, le=65536, description="samples that wait to be read; further ones are dropped")
     ] = 1024

@@ -95,7 +95,6 @@ def finding_text(finding: Finding, structure: Structure, type_name: str) -> str:
 
 
 def _sensors(finding: Finding, structure: Structure, type_name: str) -> npt.NDArray[np.int64]:
-    """Return (k,) positions in a snapshot of the sensors of a finding."""
     sensors: npt.NDArray[np.int64] = structure.index(type_name)[finding.taxels]
     return sensors
 

@@ -132,7 +132,6 @@ def _common(service: ServiceReader[Any], frame: Sample | None) -> dict[str, Any]
 
 
 def _times(of: WriterStatistics | ReaderRecord) -> dict[str, Any]:
-    """Return times: extremes and means, and histograms with two bounds from them."""
     spreads = {
         name: {"count": s.count, "best_ns": s.best_ns, "mean_ns": round(s.mean_ns), "worst_ns": s.worst_ns}
         for name, s in (("wall", of.wall), ("cpu", of.cpu))

@@ -345,7 +345,6 @@ class SkinTop(App[None]):
             self._draw_soon()
 
     def _hidden_rows(self) -> list[str]:
-        """Return how many rows of the list are above and below those that are seen."""
         rows, seen = len(self._list.rows), max(0, self._list.size.height - 1)  # without the titles
         if not rows or not seen:
             return []

@@ -81,7 +81,6 @@ def command(
 
 
 def _the_only_one(namespace: Namespace) -> str:
-    """Return the only service that can be pressed; refuse none or several."""
     from skinware.service import ServiceReader
 
     able = []

@@ -164,7 +164,6 @@ class _Progress:
         self._saved: list[Path] = []
 
     def ready(self, names: tuple[str, ...], namespace: str, *, is_past: bool) -> None:
-        """Report the beginning of a recording of everything, or of the past only."""
         self._names, self._namespace, self._is_past = names, namespace, is_past
         if self._as_json:
             print_json({"event": "ready", "file": str(self._path), "namespace": namespace, "names": list(names)})

@@ -248,11 +248,7 @@ RATE_HZ = 30.0
 
 @dataclass
 class _Driver:
-    """One that is shown.
-
-    Attributes:
-        due_ns: when the next frame is due, wall clock.
-    """
+    """``due_ns``: when its next frame is shown, wall clock."""
 
     generation: Generation
     showing: Showing

@@ -269,7 +269,6 @@ class DriverSetup:
         await runner.change_geometry(geometry)
 
     def _with_given(self, file: ConfigFile) -> DriverConfig:
-        """Return the settings of the file, except where the command line has others."""
         return msgspec.structs.replace(file.settings, **self._given)
 
     def _named(self, texts: Sequence[str]) -> list[NamedBus]:

@@ -282,11 +282,7 @@ class _Files:
 
 
 class _FeatureStatistics:
-    """Statistics of all features.
-
-    Args:
-        most_bytes: bytes of rows kept for the quantiles of a feature.
-    """
+    """``most_bytes``: of the rows that are kept for the quantiles of a feature."""
 
     def __init__(self, features: Mapping[str, Feature], lengths: Sequence[int], most_bytes: int) -> None:
         self._of: dict[str, Statistics] = {}

@@ -22,18 +22,18 @@ from enum import Enum
 from importlib.util import find_spec
 from typing import Any
 
-import zenoh
-import zenoh.ext
-
 from skinware.bridge.endpoints import DEFAULT_ROUTER, Endpoints, endpoints
-from skinware.bridge.link import directly, open_session
 from skinware.errors import BridgeError, MissingExtra
 from skinware.ros2.transport import Cdr, Distro, Handler, MessageType, NodeIdentity, Qos, ServiceType, TopicPublisher
 
-if find_spec("xxhash") is None:
+if find_spec("zenoh") is None or find_spec("xxhash") is None:
     raise MissingExtra.of("ROS 2 over zenoh", "skinware[ros2-zenoh]")
 
 import xxhash
+import zenoh
+import zenoh.ext
+
+from skinware.bridge.link import directly, open_session
 
 _LISTEN = "tcp/127.0.0.1:0"
 _SETTINGS = {

@@ -57,19 +57,16 @@ def frame(sequence: int, time_ns: int | None = None) -> bytes:
 
 
 def coded(payload: bytes, keeps: int = 1) -> bytes:
-    """A coded frame."""
     return struct.pack("<BB6x", 1, keeps) + payload
 
 
 def services(*names: str, **more: Any) -> bytes:
-    """A list of services."""
     one = {"generation": GENERATION, "state": "live", "sequence": 0} | more.pop("service", {})
     told = {"instance": INSTANCE, "start": "x", "services": dict.fromkeys(names or ("pose",), one)}
     return json.dumps(told | more).encode()
 
 
 def generation(raw: bytes | None = None, about: bytes = b'{"operations":{"tare":"x"}}') -> bytes:
-    """A generation."""
     return struct.pack("<I", len(about)) + about + zlib.compress(head() if raw is None else raw)
 
 
@@ -95,7 +92,6 @@ class Lies:
 
 @contextmanager
 def lying(net: Net, lies: Lies) -> Iterator[NetLink]:
-    """The liar, at work."""
     keys, link, ended = Keys(ROBOT, INSTANCE), NetLink(net), threading.Event()
     asked: queue.SimpleQueue[Question] = queue.SimpleQueue()
 

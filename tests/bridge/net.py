@@ -86,8 +86,6 @@ class _Sender(Sender):
 
 
 class NetLink(Link):
-    """An end of a :class:`Net`."""
-
     def __init__(self, net: Net) -> None:
         self._net = net
         self._own: list[str] = []

@@ -56,7 +56,6 @@ taken: dict[str, set[int]] = {}
 
 
 def take(there: DriverReader) -> int:
-    """The value of the newest frame."""
     value = int(there.read().values[0])
     taken.setdefault(there.name, set()).add(value)
     return value
@@ -260,8 +259,6 @@ def test_a_pause_is_seen_here(ends: Ends) -> None:
 
 
 class Tared:
-    """A service that can do something."""
-
     def __init__(self) -> None:
         self.called: list[dict[str, object]] = []
 

@@ -55,7 +55,6 @@ def listing(port: int, *options: str) -> Any:
 
 @contextmanager
 def pump(namespace: Namespace) -> Iterator[None]:
-    """A service that can do something."""
 
     def tare() -> str:
         """Take the present load as none."""

@@ -91,7 +91,6 @@ class Graph:
 
 @contextmanager
 def served(namespace: Namespace, *names: str, **options: Any) -> Iterator[tuple[Graph, Ros2Server]]:
-    """Drivers of a namespace in a graph."""
     graph = Graph()
     server = Ros2Server(graph, namespace, names, **options)
     thread = threading.Thread(target=server.run, name="ros2")

@@ -69,8 +69,6 @@ class Message:
 
 @dataclass
 class Heard:
-    """Messages of a topic so far."""
-
     messages: list[Message] = field(default_factory=list)
 
     def __len__(self) -> int:

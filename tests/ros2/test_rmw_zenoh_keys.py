@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from skinware.errors import BridgeError
+from skinware.errors import BridgeError, MissingExtra
+from skinware.ros2 import rmw_zenoh
 from skinware.ros2.rmw_zenoh import EndpointKind, MessageAttachment, endpoint_token, gid, key, node_token, qos_text
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos, ServiceType
 
@@ -126,3 +129,11 @@ def test_any_bytes_are_an_attachment_or_refused(data: bytes) -> None:
         assert MessageAttachment.of(data).packed() == data
     except ValueError:
         assert len(data) != 33 or data[16] != 16
+
+
+@pytest.mark.parametrize("package", ["zenoh", "xxhash"])
+def test_a_package_that_is_missing_is_one_of_an_extra(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == package else find_spec(name))
+    with pytest.raises(MissingExtra, match=r"pip install 'skinware\[ros2-zenoh\]'"):
+        importlib.reload(rmw_zenoh)

@@ -31,7 +31,6 @@ def small(patches: int = 1) -> Any:
 
 
 def told(graph: Graph, topic: str, count: int = 1) -> list[Any]:
-    """Messages, at least so many."""
     wait_until(lambda: len(graph.heard(topic)) >= count)
     return graph.heard(topic)
 

@@ -24,7 +24,6 @@ def test_a_port_is_looked_up_as_the_manual_says() -> None:
 
 
 def answers(*pieces: bytes) -> Callable[[socket.socket], None]:
-    """Says this whatever it hears."""
 
     def handle(caller: socket.socket) -> None:
         for piece in pieces:

@@ -25,8 +25,6 @@ OURS = "/skinware/hand"
 
 
 class There:
-    """An output port in an event loop of its own."""
-
     def __init__(self, names: NameServer) -> None:
         self.loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self.loop.run_forever)

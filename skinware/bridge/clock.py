@@ -15,6 +15,7 @@ import numpy.typing as npt
 from skinware.bridge.link import Guard, Link, Priority
 from skinware.bridge.messages import Keys
 from skinware.errors import BridgeError
+from skinware.limits import LIMITS
 from skinware.realtime import NS_PER_S, now_ns
 
 _KEPT_NS = 30 * NS_PER_S
@@ -31,8 +32,6 @@ QUESTIONS = 16
 """Questions of a round, one after the other."""
 _PING = struct.Struct("<16sq")
 _PONG = struct.Struct("<qqq")
-_LATEST_NS = 1 << 61
-"""More than any clock shows."""
 
 _Floats = npt.NDArray[np.float64]
 
@@ -186,7 +185,7 @@ class Pinger:
         if not self._since_ns <= asked_ns <= returned_ns:
             return  # from another bridge, which may have another clock
         took_ns = answered_ns - heard_ns
-        if not 0 <= heard_ns < _LATEST_NS or not 0 <= took_ns <= returned_ns - asked_ns:
+        if not 0 <= heard_ns < LIMITS.time_ns or not 0 <= took_ns <= returned_ns - asked_ns:
             raise BridgeError(f"a clock that shows {heard_ns} ns, and {took_ns} ns later, cannot be")
         is_newest, is_last = asked_ns == self._question_ns, self._left == 0
         if is_newest and not is_last:

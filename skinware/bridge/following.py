@@ -24,8 +24,6 @@ _FIRST_GENERATION_S, _LAST_GENERATION_S = 2.0, 32.0
 """Patience for a generation; it doubles after each question without an answer, since a slow link needs long."""
 _AGAIN_NS = NS_PER_S // 4
 """Pause after a frame that could not be published."""
-_LATEST_NS = 1 << 61
-"""More than any clock shows."""
 
 
 class FrameOutput:
@@ -321,7 +319,7 @@ class ServiceFollower:
             count = generation.published_before + frame.sequence
             if not (0 < frame.sequence <= count <= MOST_FRAMES):
                 raise BadRecording(f"it has number {count}")
-            if max(frame.acquired_ns, frame.published_ns) > _LATEST_NS:
+            if max(frame.acquired_ns, frame.published_ns) > LIMITS.time_ns:
                 raise BadRecording("its times are of no clock")
         except (BridgeError, BadRecording) as error:
             self._refuse_frame(error)

@@ -18,8 +18,7 @@ from skinware.conversion.tables import COLUMNS, TIME, Table, TableSource
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.memory.file_layout import SLOT
-from skinware.realtime import NS_PER_S
-from skinware.recording.files import Head, PendingChunk, RecordingFile, SampleStream
+from skinware.recording.files import CHUNK_NS, Head, PendingChunk, RecordingFile, SampleStream
 from skinware.recording.mcap_writing import McapFile, OpenChunk
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, SCHEMAS, Channels
 from skinware.structure import Structure
@@ -63,9 +62,6 @@ def _of_table(table: Table) -> Iterator[TimedFrame]:
             yield TimedFrame(time_ns, table.service, generation, frame_of(generation, slot))
 
 
-_CHUNK_NS = NS_PER_S // 4
-
-
 def write_recording(source: TableSource, path: Path) -> None:
     file = RecordingFile(path)
     writer = _RecordingWriter(file)
@@ -77,7 +73,7 @@ def write_recording(source: TableSource, path: Path) -> None:
     begun_ns = 0
     try:
         for time_ns, add in heapq.merge(*items, key=itemgetter(0)):
-            if writer.pending.is_large or time_ns >= begun_ns + _CHUNK_NS:
+            if writer.pending.is_large or time_ns >= begun_ns + CHUNK_NS:
                 writer.close_chunk()
                 begun_ns = time_ns
             add()

@@ -24,6 +24,8 @@ from skinware.transfer.generation import Generation
 _REPEATED_AFTER_NS = 60 * NS_PER_S
 _REPEATED_AFTER_BYTES = 64 << 20
 _CHUNK_BYTES = 8 << 20
+CHUNK_NS = NS_PER_S // 4
+"""A chunk is closed so long after its first message; a killed recorder loses at most that."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, WAIT_SLICE_NS, boot, now_ns, short_turns
-from skinware.recording.files import Head, PendingChunk, SampleStream, Target
+from skinware.recording.files import CHUNK_NS, Head, PendingChunk, SampleStream, Target
 from skinware.recording.topics import CLOCK, EVENTS, FRAME, GENERATION, Channels
 from skinware.recording.wire import message_of
 from skinware.transfer.codec import CodedColumn, FrameEncoder
@@ -34,8 +34,6 @@ from skinware.transfer.collecting import UNREADABLE, Collector
 from skinware.transfer.generation import Generation, disguised
 from skinware.wire import COLUMNS, KIND
 
-_CHUNK_NS = NS_PER_S // 4
-"""A chunk is closed so long after its first message; a killed recorder loses at most that."""
 _CLOCK_NS = _REPORT_NS = NS_PER_S
 _MOST_WAITING = 128 << 20
 """Bytes of samples in memory."""
@@ -355,7 +353,7 @@ class _Coder(threading.Thread):
 
     def _begin_chunk(self) -> None:
         if self._pending.chunk.is_empty:
-            self._due_ns = now_ns() + _CHUNK_NS
+            self._due_ns = now_ns() + CHUNK_NS
 
 
 def _wires_of(segment: segments.Segment) -> _WireStream | None:

@@ -23,7 +23,6 @@ from tests.commands import BIN, PATIENCE_S
 
 
 def dumped(capsys: pytest.CaptureFixture[str], *arguments: str) -> list[dict[str, Any]]:
-    """What ``skin-dump --json`` prints."""
     assert exit_status(command, [*arguments, "--json"]) == 0
     printed = capsys.readouterr()
     assert printed.err == ""

@@ -30,7 +30,6 @@ UNTOLD |= {"data_path": "not_told"}
 
 
 def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> Any:
-    """What ``skin-info --json`` prints."""
     assert exit_status(command, [*arguments, "--json"]) == 0
     printed = capsys.readouterr()
     assert printed.err == ""

@@ -164,7 +164,6 @@ Print = Callable[..., list[Any]]
 
 @pytest.fixture
 def printing(capsys: pytest.CaptureFixture[str]) -> Print:
-    """Runs a command and gives what it prints."""
 
     def run(command: click.Command, *arguments: str, status: int = 0) -> list[Any]:
         assert exit_status(command, [*arguments, "--json"]) == status, capsys.readouterr().err

@@ -40,7 +40,6 @@ def lightness(colour: ColorTriplet, eye: str = "most") -> float:
 
 
 def as_shown(name: str, colour: ColorTriplet) -> ColorTriplet:
-    """What a terminal of this ability makes of a colour."""
     sent = Color.from_triplet(colour).downgrade(PALETTES[name][1])
     if name in SIXTEEN:
         assert sent.number is not None

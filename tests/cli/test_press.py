@@ -23,7 +23,6 @@ BUS = "udp_multicast:239.74.163.2?port=43121"
 
 
 def pressed(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0) -> str:
-    """What is printed."""
     assert exit_status(press, arguments) == status
     told = capsys.readouterr()
     return told.err if status else told.out

@@ -45,7 +45,6 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def hear(channel: str, act: Callable[[], None]) -> list[can.Message]:
-    """What is sent on a bus of this process."""
     with can.Bus(interface="virtual", channel=channel) as bus:
         act()
         found: list[can.Message] = []

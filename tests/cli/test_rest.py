@@ -17,8 +17,6 @@ FRESH = np.ones(N, bool)
 
 
 class Watching:
-    """Shows values to a baseline, at 20 Hz."""
-
     def __init__(self) -> None:
         self.rest = DriverRest(STRUCTURE)
         self.time_ns = 10**9

@@ -22,7 +22,6 @@ from tests.commands import run, running
 
 
 def told(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, Any]:
-    """What ``skin-info --health --json`` prints."""
     assert exit_status(command, ["--health", "--json", *arguments]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     return found

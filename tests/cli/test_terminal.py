@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +20,7 @@ import skinware
 import skinware_drivers
 from skinware import DriverWriter, Structure
 from skinware.cli._command import exit_status
-from skinware.cli._terminal import Formatter, echo, json_text, overwrite, shown, style
+from skinware.cli._terminal import Formatter, echo, enter_pressed, json_text, overwrite, shown, style
 from skinware.cli._top_app import _printable
 from skinware.cli.top import show_lines
 from skinware.memory.namespace import Namespace
@@ -149,3 +151,16 @@ def test_there_is_one_way_to_print() -> None:
         if re.search(r"click\.(echo|secho|style)\(|^\s*print\(", line) and "noqa: T201" not in line
     ]
     assert not others, "use echo and style of skinware.cli._terminal"
+
+
+def test_enter_belongs_to_the_program_in_the_foreground(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = os.openpty()
+    with open(theirs) as terminal:
+        monkeypatch.setattr(sys, "stdin", terminal)
+        assert not enter_pressed()
+        os.write(ours, b"\n")
+        monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+        assert not enter_pressed()
+        monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+        assert (enter_pressed(), enter_pressed()) == (True, False)
+    os.close(ours)

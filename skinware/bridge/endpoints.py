@@ -113,8 +113,6 @@ def endpoints(
     """Check what a person wrote, and return the settings.
 
     Args:
-        listen: where to listen.
-        connect: where to connect.
         tls: folder with ``ca.pem``, ``cert.pem`` and ``key.pem``; both ends show a certificate of that authority.
         rules: rights of peers; None: this end only joins.
         insecure: listen beyond this machine without TLS.

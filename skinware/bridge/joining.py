@@ -31,9 +31,6 @@ class Joiner:
     """Publishes the services of a robot in a namespace of this machine.
 
     Args:
-        robot: its name.
-        link: to it.
-        namespace: where its services appear.
         mode: ``push`` or ``pull``; None: the mode of each service follows the link.
         wish: the sensors that are wanted, without services that are no drivers; None: all services.
         why_not: returns, in one line, the reason why nothing is reached, or an empty text; called in a thread.

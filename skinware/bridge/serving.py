@@ -89,9 +89,6 @@ class Server:
     """Serves the services of a namespace as those of a robot.
 
     Args:
-        robot: its name.
-        link: to the peers.
-        namespace: whose services.
         names: of services; None: all, also later ones.
         callers: names of the certificates that may call, for people.
 

@@ -125,7 +125,6 @@ class Watcher:
     """Follows all robots that a link leads to, without reading their frames.
 
     Args:
-        link: to them.
         asks: collect their summaries; otherwise only their names.
 
     Attributes:

@@ -77,7 +77,6 @@ class Recording:
         path: of the file.
 
     Attributes:
-        path: of the file.
         is_whole: it ends with its summary; others can be read too, but more slowly (``skin-recover``).
         start_ns, end_ns: time of its first and last message, ns since 1970. Times between them follow
             CLOCK_MONOTONIC; ``clock`` says how the wall clock was set meanwhile.
@@ -339,9 +338,6 @@ class Recording:
         """Return the last description of a driver: see "Recordings" in the documentation.
 
         Empty if its wires were not recorded, and in files of earlier versions.
-
-        Args:
-            driver: its name.
         """
         about: dict[str, Any] = {}
         channel = self._abouts.get(driver)

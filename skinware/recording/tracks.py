@@ -32,7 +32,6 @@ class Series:
         columns: (n, ...) by name.
 
     Attributes:
-        origin, headers, time_s, columns: as given.
         generation: (n,) uint64, number of each sample's generation.
         sequence: (n,) uint64, number of each sample in its generation; a jump means lost samples.
         acquired_ns: (n,) int64, newest time stamp of the data, CLOCK_MONOTONIC of the machine that recorded.
@@ -141,9 +140,6 @@ class Track:
         channel: number of the channel of its samples.
         generations: the generations to read, by number.
         known: numbers of all generations that the recording describes; default: the same.
-
-    Attributes:
-        name: of the service.
     """
 
     def __init__(

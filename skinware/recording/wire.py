@@ -97,9 +97,6 @@ class WireTrack:
         driver: name of the driver.
         bus: name of the bus.
         channel: number of its channel.
-
-    Attributes:
-        driver, bus: as above.
     """
 
     def __init__(self, recording: Recording, driver: str, bus: str, channel: int) -> None:

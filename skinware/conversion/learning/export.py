@@ -57,7 +57,6 @@ def convert_to_learning_set(
     Args:
         paths: recordings; they are only read.
         target: the new folder, which must not exist; None: beside the first recording.
-        wanted: definition of the set.
         selection: the drivers and sensors to convert; None: all.
         start_s: begin at this time in each recording, s since it began.
         end_s: end before this time; None: at the end of each recording.

@@ -303,12 +303,7 @@ class Moments:
 
 
 class ChosenRows:
-    """Evenly chosen rows of those that are added.
-
-    Args:
-        rows: number of rows to come.
-        most_bytes: of the rows to keep.
-    """
+    """Evenly chosen rows of the ``rows`` that are added, of ``most_bytes`` at most."""
 
     def __init__(self, shape: tuple[int, ...], dtype: npt.DTypeLike, rows: int, most_bytes: int) -> None:
         row_bytes = np.dtype(dtype).itemsize * math.prod(shape)
@@ -333,11 +328,7 @@ class ChosenRows:
 
 
 class Statistics:
-    """Statistics of the rows of a feature.
-
-    Args:
-        most_bytes: of the rows kept for quantiles.
-    """
+    """Statistics of the rows of a feature; ``most_bytes``: of the rows that are kept for quantiles."""
 
     def __init__(
         self, shape: tuple[int, ...], dtype: npt.DTypeLike, rows: int, most_bytes: int, per_item: int = 1

@@ -50,8 +50,6 @@ class Join(NamedTuple):
     """Columns of a file that become a feature.
 
     Attributes:
-        feature: name of the feature.
-        path: of the file.
         columns: names; empty: all but the time.
     """
 
@@ -84,7 +82,6 @@ class LearningSet:
             has them; ``points``: (n, 6) places and forces.
         numbers: of ``state``: sum and largest value of each ``module``, each ``taxel``, or place and force (``point``).
         size: height and width of images.
-        colours: of images.
         value_range: of the darkest and brightest colour; None: of the sensor type.
     """
 
@@ -240,11 +237,7 @@ class Joined:
             raise ConfigurationError(f"{self.path}: time goes back after row {backward[0] + 1}")
 
     def times_ns(self, source: TableSource, *, is_only: bool) -> npt.NDArray[np.int64]:
-        """Return the time of each row, (m,) ns since 1970, on the axis of the recording.
-
-        Args:
-            is_only: it is the only recording.
-        """
+        """Return the time of each row, (m,) ns since 1970, on the axis of the recording."""
         if self._time in _OF_ONE_RECORDING and not is_only:
             raise ConfigurationError(
                 f"{self.path}: {self._time} is of one recording: with several, give time_ns or unix_s"

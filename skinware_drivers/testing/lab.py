@@ -45,7 +45,6 @@ PACKAGES = {
 }
 """Kernels to choose from, and the Debian packages that the lab needs with them."""
 USER_KERNEL = "linux.uml"
-USER_MODULES = Path("/usr/lib/uml/modules")
 
 
 def find_kernel(flavour: str) -> Path | None:
@@ -63,6 +62,13 @@ def _has_modules(folder: Path) -> bool:
     except OSError:
         return False
     return all(f"/{module}.ko" in known for module in MODULES.split())
+
+
+def find_user_modules() -> Path | None:
+    """Return the folder of User-Mode Linux' modules, ``../lib`` of its command's; None: it is not installed."""
+    kernel = _which(USER_KERNEL)
+    folder = Path(kernel or "/").absolute().parent.parent / "lib" / "uml" / "modules"
+    return folder if kernel and folder.is_dir() else None
 
 
 def find_vng() -> str | None:
@@ -84,7 +90,7 @@ def missing(flavour: str) -> list[str]:
     commands = ("ip", "modprobe") if flavour == "user" else ("ip", "modprobe", "file")  # virtme-ng uses the last
     lacks = [f"the command {name}" for name in commands if _which(name) is None]
     if flavour == "user":
-        return lacks + ([] if _which(USER_KERNEL) and USER_MODULES.is_dir() else ["User-Mode Linux"])
+        return lacks + ([] if find_user_modules() else ["User-Mode Linux"])
     if _which("qemu-system-x86_64") is None:
         lacks.append("qemu-system-x86_64")
     if find_kernel(flavour) is None:
@@ -119,7 +125,7 @@ def guest_script(flavour: str, command: list[str], folder: Path) -> str:
         modules = MODULES.replace(" kvaser_pci", "")
         mount_files = f"""
         mount -t proc proc /proc && mount -t sysfs sys /sys && mount -t tmpfs tmpfs /run
-        modules={USER_MODULES}/$(uname -r)
+        modules={find_user_modules()}/$(uname -r)
         insmod $modules/kernel/fs/overlayfs/overlay.ko
         cd /run && mkdir new work all
         mount -t overlay -o lowerdir=/,upperdir=new,workdir=work overlay all
@@ -189,7 +195,11 @@ def _run_in_user_mode(script: Path, timeout_s: float) -> int:
     """)
     first.chmod(0o755)
     kernel = [_which(USER_KERNEL) or "", "rootfstype=hostfs", "rootflags=/", "ro", "mem=2G", f"init={first}"]
-    booted = boot([*kernel, "con=null", "con0=null,fd:1", "quiet"], {**os.environ, "TMPDIR": str(place)}, timeout_s)
+    booted = boot(
+        [*kernel, "con=null", "con0=null,fd:1", "seccomp=auto", "quiet"],
+        {**os.environ, "TMPDIR": str(place)},
+        timeout_s,
+    )
     return int(status.read_text()) if status.exists() else booted or 1
 
 

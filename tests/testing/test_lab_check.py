@@ -26,13 +26,15 @@ def put(path: Path, script: str) -> None:
 @pytest.fixture
 def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with all the commands of a machine that can run the lab."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
     for name in NEEDED:
-        put(tmp_path / name, f'echo "$2: {STATIC}"')
-    monkeypatch.setattr(lab, "_path", lambda: f"{tmp_path}")
-    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+        put(folder / name, f'echo "$2: {STATIC}"')
+    monkeypatch.setattr(lab, "_path", lambda: f"{folder}")
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
     monkeypatch.setattr(lab, "find_kernel", lambda flavour: Path(f"/boot/vmlinuz-{flavour}"))
-    monkeypatch.setattr(lab, "find_vng", lambda: str(tmp_path / "vng") if (tmp_path / "vng").exists() else None)
-    return tmp_path
+    monkeypatch.setattr(lab, "find_vng", lambda: str(folder / "vng") if (folder / "vng").exists() else None)
+    return folder
 
 
 @pytest.mark.usefixtures("machine")
@@ -41,21 +43,19 @@ def test_a_machine_that_has_all_can_run_it(capsys: pytest.CaptureFixture[str]) -
     assert capsys.readouterr().out == "the CAN lab can run: /boot/vmlinuz-plain\n"
 
 
-def test_user_mode_linux_needs_no_machine(
-    machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_user_mode_linux_needs_no_machine(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in set(NEEDED) - {"ip", "modprobe"}:
         (machine / name).unlink()
-    monkeypatch.setattr(lab, "USER_MODULES", machine)
+    put(machine / lab.USER_KERNEL, "")
     assert lab.report("user", lab.missing("user")) == 1
     assert "missing: User-Mode Linux\ninstall: apt-get install" in capsys.readouterr().err
-    put(machine / lab.USER_KERNEL, "")
+    (machine.with_name("lib") / "uml" / "modules").mkdir(parents=True)
     assert lab.report("user", lab.missing("user")) == 0
     assert capsys.readouterr().out == "the CAN lab can run: linux.uml\n"
 
 
-def test_the_status_of_a_command_in_user_mode_linux_is_its_own(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lab, "USER_MODULES", machine)
+def test_the_status_of_a_command_in_user_mode_linux_is_its_own(machine: Path) -> None:
+    (machine.with_name("lib") / "uml" / "modules").mkdir(parents=True)
     find_init = 'for word in "$@"; do case $word in init=*) place=${word#init=} ;; esac; done'
     put(machine / lab.USER_KERNEL, f"{find_init}; echo CAN lab: up; echo 3 >${{place%init}}status")
     assert lab.run("user", ["false"], 60.0, machine) == 3

@@ -44,7 +44,7 @@ class Actuators:
     def __init__(self, bound: Bound, model: Any, data: Any) -> None:
         self.names: list[str] = names_of(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
         self.poses: Mapping[str, Mapping[str, float]] = bound.binding.pose
-        self._data = data
+        self._data, self._ctrl = data, data.ctrl
         self._moves, self._repeat_s = bound.binding.move, bound.binding.repeat_s
         self._ramps: dict[int, tuple[float, float, float, float]] = {}  # actuator -> begin, end, from, to
         self.reset()
@@ -63,37 +63,29 @@ class Actuators:
         now_s = float(self._data.time)
         for name, target in targets.items():
             actuator = self.names.index(name)
-            self._ramps[actuator] = now_s, now_s + seconds, float(self._data.ctrl[actuator]), float(target)
+            self._ramps[actuator] = now_s, now_s + seconds, float(self._ctrl[actuator]), float(target)
 
     def hold(self) -> None:
         """Stop every movement: the actuators keep the targets that they have."""
         self._ramps.clear()
 
-    def course(self, steps: int, step_s: float) -> npt.NDArray[np.float64]:
-        """Return (n, actuators) the targets of the next steps, at most ``steps``: up to the next move of the scene."""
-        self._begin_moves()
-        times_s = np.full(steps, step_s)
-        times_s[0] = self._data.time
-        times_s = np.cumsum(times_s)
+    def drive(self) -> None:
+        """Set the targets of the step that begins now."""
+        now_s, ctrl = self._data.time, self._ctrl
         if self._next_move < len(self._moves):
-            times_s = times_s[: max(1, int(np.searchsorted(times_s + _EPSILON_S, self._due_s())))]
-        targets = np.repeat(self._data.ctrl[np.newaxis], len(times_s), axis=0)
-        if self._ramps:
-            moving = list(self._ramps)
-            begin_s, end_s, start, target = np.array(list(self._ramps.values())).T
-            passed = (times_s[:, np.newaxis] - begin_s) / np.maximum(end_s - begin_s, _EPSILON_S)
-            share = np.where(times_s[:, np.newaxis] >= end_s, 1.0, passed)
-            targets[:, moving] = start + share * (target - start)
-            for row in np.flatnonzero(times_s[-1] >= end_s).tolist():
-                del self._ramps[moving[row]]
-        return targets
+            self._begin_moves(now_s)
+        for actuator, (begin_s, end_s, start, target) in list(self._ramps.items()):
+            if now_s >= end_s:
+                ctrl[actuator] = target
+                del self._ramps[actuator]
+            else:
+                ctrl[actuator] = start + (now_s - begin_s) / (end_s - begin_s) * (target - start)
 
-    def _due_s(self) -> float:
-        return self._moves[self._next_move].at_s + self._round * (self._repeat_s or 0.0)
-
-    def _begin_moves(self) -> None:
-        while self._next_move < len(self._moves) and self._data.time + _EPSILON_S >= self._due_s():
+    def _begin_moves(self, now_s: float) -> None:
+        while self._next_move < len(self._moves):
             move = self._moves[self._next_move]
+            if now_s + _EPSILON_S < move.at_s + self._round * (self._repeat_s or 0.0):
+                return
             self.move(self.poses[move.pose], move.seconds)
             self._next_move += 1
             if self._next_move == len(self._moves) and self._repeat_s is not None:
@@ -263,20 +255,18 @@ class PhysicsScene:
         MuJoCo computes its sensors in the last step alone.
         """
         option = self.model.opt
-        step_s, flags, ctrl = option.timestep, option.disableflags, self.data.ctrl
-        steps = left = max(0, int((time_s - self.data.time) / step_s + 1e-6))
+        step_s, flags = option.timestep, option.disableflags
+        steps = max(0, int((time_s - self.data.time) / step_s + 1e-6))
         if steps:
             self._touching = None
             option.disableflags = flags | _NO_SENSORS
-        while left:
-            for targets in self.actuators.course(left, step_s):
-                left -= 1
-                if not left:
-                    option.disableflags = flags
-                ctrl[:] = targets
-                mujoco.mj_step(self.model, self.data)
-                if self.notes_touch:
-                    self._note_touch(step_s)
+        for left in reversed(range(steps)):
+            if not left:
+                option.disableflags = flags
+            self.actuators.drive()
+            mujoco.mj_step(self.model, self.data)
+            if self.notes_touch:
+                self._note_touch(step_s)
         return steps
 
     def _note_touch(self, step_s: float) -> None:

@@ -76,8 +76,6 @@ class WorldServices:
             description="joints of a simulated scene",
             operations={"move": self.move, "hold": self.hold},
         )
-        addresses = zip(scene.model.jnt_qposadr, scene.model.jnt_dofadr, strict=True)
-        self._joint_rows = [(int(position), int(velocity)) for position, velocity in addresses]
 
     def serve(self, time_ns: int) -> None:
         """Carry out commands, and publish what is due.
@@ -126,9 +124,8 @@ class WorldServices:
         columns["lag_s"][0] = (now_ns() - time_ns) / NS_PER_S
         self._truth.commit(time_ns)
         columns = self._joints.begin(from_last=True)
-        for row, (position, velocity) in enumerate(self._joint_rows):
-            columns["position"][row] = scene.data.qpos[position]
-            columns["velocity"][row] = scene.data.qvel[velocity]
+        columns["position"][: len(scene.joints)] = scene.data.qpos[scene.model.jnt_qposadr]
+        columns["velocity"][: len(scene.joints)] = scene.data.qvel[scene.model.jnt_dofadr]
         columns["target"][: len(scene.actuators.names)] = scene.data.ctrl
         columns["commanded_s"][0] = scene.actuators.commanded_s
         if scene.carrier is not None:
@@ -141,6 +138,7 @@ def _texts(names: list[str]) -> Any:
 
 
 ArrayF = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64]
 
 _LONGEST_CATCH_UP_S = 1.0
 """Time that the physics makes up for; it leaves out more."""
@@ -164,16 +162,17 @@ class PhysicsWorld:
         self.scene = PhysicsScene(bound)
         self._speed = speed
         self._bound = bound
-        # device -> modules, and by axis which values of the device are theirs
-        self._of_device: dict[int, list[tuple[int, list[tuple[slice, int]]]]] = {}
+        # device -> modules, which values of the device are theirs, and where in their counts those are
+        self._of_device: dict[int, list[tuple[int, Rows, Rows]]] = {}
         next_value: dict[int, int] = {}
         for number, module in enumerate(self.scene.modules):
             device, axes = module.binding.device, module.binding.axes
             first = next_value.get(device, 0) if module.binding.first is None else module.binding.first
-            end = next_value[device] = first + len(axes) * len(module.position_m)
-            rows = [(slice(first + place, end, len(axes)), axis) for place, axis in enumerate(map(_AXES.find, axes))]
-            felt = [(values, axis) for values, axis in rows if axis >= 0]
-            self._of_device.setdefault(device, []).append((number, felt))
+            next_value[device] = first + len(axes) * len(module.position_m)
+            taxel, place = np.divmod(np.arange(next_value[device] - first), len(axes))
+            axis = np.array([_AXES.find(axis) for axis in axes])[place]
+            felt = np.flatnonzero(axis >= 0)
+            self._of_device.setdefault(device, []).append((number, first + felt, (3 * taxel + axis)[felt]))
         self._ends = next_value
         self._has_services = has_services
         self._services: WorldServices | None = None
@@ -233,21 +232,16 @@ class PhysicsWorld:
         if time_ns != self.advanced_ns:
             self.advance(time_ns)
         values = np.zeros(n_values)
-        for module, felt in self._of_device.get(device, []):
+        for module, rows, counted in self._of_device.get(device, []):
             counts = self._transfers[module].counts(self.forces()[module], self.since_s(time_ns))
-            for rows, axis in felt:
-                values[rows] = counts[:, axis]
+            values[rows] = counts.ravel()[counted]
         return values
 
-    def rows(self, numbers: Sequence[int], n_values: int) -> npt.NDArray[np.int64]:
+    def rows(self, numbers: Sequence[int], n_values: int) -> Rows:
         """Return (n,) which values of all devices are those of taxels, ascending."""
         self.fit(numbers, n_values)
-        is_felt = np.zeros((len(numbers), n_values), bool)
-        for place, device in enumerate(numbers):
-            for _, felt in self._of_device.get(device, []):
-                for rows, _ in felt:
-                    is_felt[place, rows] = True
-        return np.flatnonzero(is_felt)
+        of_modules = [(device, rows) for device, modules in self._of_device.items() for _, rows, _ in modules]
+        return np.unique(np.concatenate([numbers.index(device) * n_values + rows for device, rows in of_modules]))
 
     def close(self) -> None:
         self.scene.close()

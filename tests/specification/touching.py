@@ -56,6 +56,12 @@ def distances(taxels: BoundTaxels, point_m: ArrayF, normal: ArrayF) -> ArrayF:
     return distance
 
 
+def depths(scene: PhysicsScene, number: int) -> ArrayF:
+    """Return (n,) MuJoCo's own tactile values of a module: depths, m."""
+    geoms, n = scene.modules[number].geoms.tolist(), len(scene.modules[number].position_m)
+    return np.sum([scene.data.sensor(f"taxels {number} on {geom}").data[:n] for geom in geoms], axis=0)  # type: ignore[no-any-return]
+
+
 def spread(taxels: BoundTaxels, depth_m: ArrayF, felt: Sequence[Touching]) -> ArrayF:
     """Return (n, 3) forces on taxels, N: shear along x and y, and normal force.
 
@@ -81,5 +87,5 @@ def newtons(scene: PhysicsScene) -> list[ArrayF]:
     felt = touches(scene)
     for number in {touch.module for touch in felt}:
         of_module = [touch for touch in felt if touch.module == number]
-        found[number] = spread(scene.modules[number], scene.raw(number)[0], of_module)
+        found[number] = spread(scene.modules[number], depths(scene, number), of_module)
     return found

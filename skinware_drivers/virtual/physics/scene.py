@@ -122,12 +122,10 @@ class SceneContacts:
     """Finds which contacts of a scene its modules feel, and spreads their forces over taxels; ``native/touching.c``.
 
     Args:
-        sensors: where the data of each module's tactile sensors are.
+        sensors: where the data of each module's tactile sensors begin.
     """
 
-    def __init__(
-        self, model: Any, data: Any, modules: Sequence[BoundTaxels], sensors: Sequence[Sequence[slice]]
-    ) -> None:
+    def __init__(self, model: Any, data: Any, modules: Sequence[BoundTaxels], sensors: Sequence[Sequence[int]]) -> None:
         library = native.library().quick
         self._find, self._spread = library.skinware_touching_find, library.skinware_touching_spread
         self._find.restype = ctypes.c_int64
@@ -144,7 +142,7 @@ class SceneContacts:
             "body": model.geom_bodyid.astype(np.int64),
             "root": model.body_rootid.astype(np.int64),
             "sensor_module": sensor_module,
-            "sensor_at": np.array([values.start for of_module in sensors for values in of_module], np.int64),
+            "sensor_at": np.concatenate(sensors).astype(np.int64),
             "reach_m": np.array([module.reach_m for module in modules]),
             "position_m": np.concatenate([module.position_m for module in modules]),
             "axes": np.concatenate([module.axes for module in modules]),
@@ -220,8 +218,8 @@ class PhysicsScene:
         except (KeyError, ValueError) as error:
             raise ConfigurationError(f"{bound.scene}: MuJoCo: {error}") from None
         self.data: Any = mujoco.MjData(self.model)
-        self._sensors = place_sensors(self.model, self.modules)
-        self._contacts = SceneContacts(self.model, self.data, self.modules, self._sensors)
+        sensors = place_sensors(self.model, self.modules)
+        self._contacts = SceneContacts(self.model, self.data, self.modules, sensors)
         covered = np.concatenate([module.geoms for module in self.modules])
         self._covered: frozenset[int] = frozenset(covered.tolist())
         self.actuators = Actuators(bound, self.model, self.data)
@@ -282,14 +280,6 @@ class PhysicsScene:
         pose[:3, :3] = to_here @ self.data.xmat[self.carrier].reshape(3, 3)
         pose[:3, 3] = to_here @ (self.data.xpos[self.carrier] - self.data.xpos[here])
         return pose
-
-    def raw(self, module: int) -> ArrayF:
-        """Return (3, n) MuJoCo's own sensor data of a module: depth, m, and its products with two speeds of slip."""
-        n = len(self.modules[module].position_m)
-        found = np.zeros((3, n))
-        for values in self._sensors[module]:
-            found += self.data.sensordata[values].reshape(3, -1)[:, :n]
-        return found
 
     def touching(self) -> list[Touching]:
         if self._touching is None:

@@ -54,7 +54,7 @@ class BoundTaxels:
     def name(self) -> str:
         return self.binding.name or self.binding.body
 
-    def group(self, type_name: str, uid: npt.NDArray[np.uint64]) -> GeometryGroup:
+    def group(self, type_name: str, uid: npt.NDArray[np.integer[Any]]) -> GeometryGroup:
         return GeometryGroup(
             type=type_name,
             frame=self.binding.body,
@@ -123,13 +123,13 @@ def add_sensors(spec: Any, taxels: list[BoundTaxels]) -> None:
             )
 
 
-def place_sensors(model: Any, taxels: list[BoundTaxels]) -> list[list[slice]]:
+def place_sensors(model: Any, taxels: list[BoundTaxels]) -> list[list[int]]:
     """Write the places of all taxels into the sensors of a compiled scene.
 
     Returns:
-        Where the values of each sensor of each module are.
+        Where the values of each sensor of each module begin.
     """
-    found: list[list[slice]] = []
+    found: list[list[int]] = []
     for number, module in enumerate(taxels):
         found.append([])
         for geom in module.geoms.tolist():
@@ -142,8 +142,7 @@ def place_sensors(model: Any, taxels: list[BoundTaxels]) -> list[list[slice]]:
             model.mesh_vert[rows] = (module.position_m - model.geom_pos[geom]) @ rotation
             model.mesh_normal[rows] = module.axes[:, 2] @ rotation
             sensor = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
-            address = int(model.sensor_adr[sensor])
-            found[-1].append(slice(address, address + 3 * count))
+            found[-1].append(int(model.sensor_adr[sensor]))
     return found
 
 

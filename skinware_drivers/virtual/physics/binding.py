@@ -1,41 +1,4 @@
-"""Which taxels of which device are on which body of a scene: a file in TOML.
-
-::
-
-    format = "skinware-binding"
-    version = 1
-    scene = "pad.xml"                     # beside this file
-    carrier = "thumb_tip"                 # body whose pose in the frame of the first module's the service joints has
-
-    [transfer]                            # of every module: see TransferSettings
-    counts_per_n = 300
-
-    [[module]]
-    body = "pad"
-    device = 1                            # number of the emulated device
-    first = 0                             # its first value; by default after the module before
-    rows = 4                              # a grid, which is projected onto the body against z = x * y
-    columns = 4
-    pitch_m = [0.003, 0.003]              # between columns, between rows
-    at_m = [0.0, 0.0, 0.01]               # its middle, in the frame of the body
-    x = [1.0, 0.0, 0.0]                   # along a row
-    y = [0.0, 1.0, 0.0]                   # from row to row
-    reach_m = 0.0045                      # of a contact to its nearest taxel; by default one and a half pitches
-    axes = "xyz"                          # values of each taxel; "-" is a value that stays at rest
-    transfer = {noise = 2.0}              # of this module
-
-    [pose.open]                           # targets of actuators
-    left = 0.03
-
-    [[move]]                              # what the scene does by itself
-    at_s = 1.0
-    pose = "open"
-    seconds = 0.5
-
-Instead of a grid, a module may name a ``geometry`` file, of which it has the sensors in the coordinate frame with the
-name of its body, and the first and last ``uid`` of them; or ``arm_board``, one of the boards of
-:func:`skinware.tactile.testing.arm`.
-"""
+"""Which taxels of which device are on which body of a scene: a file in TOML, as docs/how-to/simulate.md explains."""
 
 from __future__ import annotations
 
@@ -57,7 +20,7 @@ _Count = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 
 class ModuleBinding(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Taxels on a body. The example above explains the fields."""
+    """Taxels on a body."""
 
     body: str
     name: str = ""

@@ -27,23 +27,7 @@ _Time = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class TransferSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How a module answers force; by default it is linear and has no errors.
-
-    Attributes:
-        counts_per_n: of normal force.
-        shear_counts_per_n: of shear; None: as of normal force.
-        saturation_n: force on a taxel at which half of its counts are missing; 0: it never saturates.
-        gain_spread: standard deviation of the taxels' gains, around 1.
-        crosstalk: share of a taxel's force that the elastomer gives to its neighbours.
-        crosstalk_m: standard deviation of the distance to them, m.
-        hysteresis: share of the force by which a rising value is too low and a falling one too high.
-        creep, remainder, creep_s: as of :class:`skinware.tactile.testing.Response`.
-        noise: standard deviation, counts.
-        drift: amplitude of a slow wave, counts; each taxel has a phase of its own.
-        warmth: counts per kelvin.
-        warming_k: by how much the device warms up in the end, K.
-        warming_s: time constant of that.
-    """
+    """How a module answers force, as docs/how-to/simulate.md explains; by default it is linear and has no errors."""
 
     counts_per_n: _NotNegative = 100.0
     shear_counts_per_n: _NotNegative | None = None

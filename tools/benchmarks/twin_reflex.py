@@ -2,8 +2,11 @@
 
 The scene `gripper`, with steps of 1 ms, presses the fingertips of an emulated Allegro hand; the driver, skin-calm and
 examples/reflex.py are a process each, with real-time priorities where root starts them. The fingers close at random
-speeds. Times are of the machine's clock: that of the contact, to a step, is the time of the scene in the time of the
-device, so that physics and devices that come late count.
+speeds. The time of the contact, to a step, is that of the scene in the time of the device, so that physics and devices
+that come late count.
+
+--speed 0.25: the scene runs at a quarter of real time, for a slow machine. Periods, limit and table are in the time of
+the scene: frames come at a quarter of their rate, and each program takes a quarter of the time that it takes.
 
 --bus virtual: the devices are in the driver's process. --bus vcan0: skin-emulate is a process, too; the interface is
 made. `tools/bench twin-reflex --lab` does this in User-Mode Linux; the first line says how fast that is.
@@ -37,6 +40,7 @@ SCENE = ROOT / "skinware_drivers" / "virtual" / "physics" / "scenes" / "gripper.
 PRIORITY = 40
 """Priority of the driver; that of the emulator is one less, that of each program behind the driver one more."""
 SETTLED_S = 8.0
+OPEN_S = 0.3
 LIMIT_MS = 12
 KEPT = 4096
 """Samples of the driver that are kept, to look at those of a contact behind it."""
@@ -84,7 +88,7 @@ class Kept(NamedTuple):
     counts: Any
 
 
-def commands(bus: str, period_ms: int, folder: Path, calm: str) -> list[tuple[str, ...]]:
+def commands(bus: str, period_ms: int, speed: float, folder: Path, calm: str) -> list[tuple[str, ...]]:
     """Return the commands to start, in order; the last one is the reflex."""
     (folder / "gripper.xml").write_text(SCENE.read_text().replace('timestep="0.002"', 'timestep="0.001"'))
     (folder / "gripper.toml").write_text(BINDING)
@@ -97,12 +101,16 @@ def commands(bus: str, period_ms: int, folder: Path, calm: str) -> list[tuple[st
         (sys.executable, str(ROOT / "examples" / "reflex.py"), calm, "joints"),
     ]
     if bus == "virtual":
-        return [(*driver, "--bus", f"virtual:allegro_v5_tips?world={world}&period_ms={period_ms}"), *rest]
-    options = "--driver", "allegro_v5_tips", "--bus", bus, "--world", world, "--period-ms", str(period_ms)
-    return [("skin-emulate", *options, "--json"), (*driver, "--bus", bus), *rest]
+        options = f"world={world}&world_speed={speed}&period_ms={period_ms}"
+        return [(*driver, "--bus", f"virtual:allegro_v5_tips?{options}"), *rest]
+    emulator = "skin-emulate", "--driver", "allegro_v5_tips", "--bus", bus, "--period-ms", str(period_ms)
+    physics = "--world", world, "--world-speed", str(speed), "--json"
+    return [(*emulator, *physics), (*driver, "--bus", bus), *rest]
 
 
-def run(started: list[tuple[str, ...]], closings: int, seed: int, folder: Path) -> tuple[list[Closing], int]:
+def run(
+    started: list[tuple[str, ...]], closings: int, seed: int, speed: float, folder: Path
+) -> tuple[list[Closing], int]:
     """Close the gripper again and again; return what was stopped, and how many were not."""
     random, found, missed = np.random.default_rng(seed), [], 0
     pids: list[int] = []
@@ -124,23 +132,22 @@ def run(started: list[tuple[str, ...]], closings: int, seed: int, folder: Path) 
         joints.call("move", targets={"lift": -0.065, "close": 0.0}, seconds=1.0, timeout_s=30)
         time.sleep(SETTLED_S)
         used_s, from_s = [cpu_s(pid) for pid in pids], time.monotonic()
-        begin_ns = 1 << 62  # when the scene was at 0 s
         for _ in range(closings):
-            joints.call("move", targets={"close": 0.0}, seconds=0.3)
-            time.sleep(1.5)
+            joints.call("move", targets={"close": 0.0}, seconds=OPEN_S)
+            time.sleep(OPEN_S / speed + 1.2)
             seen = len(events.read_text().splitlines())
             seconds = float(random.uniform(0.8, 2.5))
             joints.call("move", targets={"close": 0.025}, seconds=seconds)
-            time.sleep(seconds + 0.5)
-            sample = truth.request()
-            begin_ns = min(begin_ns, sample.acquired_ns - round(1e9 * float(sample.column("scene_s")[0])))
-            contact_ns = begin_ns + round(1e9 * float(sample.column("touched_s")[0]))
+            time.sleep((seconds + 0.5) / speed)
+            samples = [truth.request() for _ in range(10)]  # the scene's time is that of its last step
+            since_s = [float(one.column("touched_s")[0] - one.column("scene_s")[0]) / speed for one in samples]
+            contact_ns = np.min([one.acquired_ns + 1e9 * since for one, since in zip(samples, since_s, strict=True)])
             lines = events.read_text().splitlines()[seen:]
             begun = [re.findall(r"\d+", line) for line in lines if line.startswith(("onset", "confirmed"))]
-            if begun:
+            if begun and np.isfinite(contact_ns):
                 _, read_us, done_us, frame_ns = map(int, begun[0])
-                pressed_n = float(sample.column("force_n")[0])
-                found.append(closing(list(kept), contact_ns, frame_ns, (read_us, done_us), pressed_n))
+                pressed_n = float(samples[-1].column("force_n")[0])
+                found.append(closing(list(kept), int(contact_ns), frame_ns, (read_us, done_us), pressed_n, speed))
             else:
                 missed += 1
         shares = [(cpu_s(pid) - before) / (time.monotonic() - from_s) for pid, before in zip(pids, used_s, strict=True)]
@@ -158,9 +165,11 @@ def keep(frames: ServiceReader[Any], kept: deque[Kept]) -> None:
             kept.append(Kept(sample.acquired_ns, sample.published_ns, sample.column("values")[::3].astype(int)[:2]))
 
 
-def closing(kept: list[Kept], contact_ns: int, frame_ns: int, ages_us: tuple[int, int], pressed_n: float) -> Closing:
+def closing(
+    kept: list[Kept], contact_ns: int, frame_ns: int, ages_us: tuple[int, int], pressed_n: float, speed: float
+) -> Closing:
     """Return the times of a closing."""
-    all_ms = (frame_ns + 1000 * ages_us[1] - contact_ns) / 1e6
+    all_ms = (frame_ns + 1000 * ages_us[1] - contact_ns) / 1e6 * speed
     rest = [one for one in kept if one.acquired_ns < contact_ns]
     between = [one for one in kept if contact_ns <= one.acquired_ns <= frame_ns]
     if not rest or not between or between[-1].acquired_ns != frame_ns:
@@ -168,7 +177,7 @@ def closing(kept: list[Kept], contact_ns: int, frame_ns: int, ages_us: tuple[int
     published_ns = between[-1].published_ns
     times_ns = [contact_ns, between[0].acquired_ns, frame_ns, published_ns, *(frame_ns + 1000 * us for us in ages_us)]
     above = [(one.counts - rest[-1].counts).tolist() for one in between]
-    return Closing(all_ms, (np.diff(times_ns) / 1e6).tolist(), above, pressed_n)
+    return Closing(all_ms, (np.diff(times_ns) / 1e6 * speed).tolist(), above, pressed_n)
 
 
 def table(found: list[Closing]) -> str:
@@ -221,6 +230,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bus", default="virtual")
     parser.add_argument("--period-ms", type=int, default=2)
+    parser.add_argument("--speed", type=float, default=1.0, help="seconds of the scene in a second (default: 1)")
     parser.add_argument("--closings", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -236,13 +246,14 @@ def main() -> None:
     try:
         with tempfile.TemporaryDirectory() as place:
             folder = Path(place)
-            started = commands(bus, arguments.period_ms, folder, calm.name)
-            found, missed = run(started, arguments.closings, arguments.seed, folder)
+            period_ms = round(arguments.period_ms / arguments.speed)
+            started = commands(bus, period_ms, arguments.speed, folder, calm.name)
+            found, missed = run(started, arguments.closings, arguments.seed, arguments.speed, folder)
     finally:
         for namespace in (source, calm):
             shutil.rmtree(namespace.path, ignore_errors=True)
     if found:
-        print(f"\n{arguments.period_ms} ms a frame on {bus}:\n\n{table(found)}")
+        print(f"\n{arguments.period_ms} ms a frame on {bus}, {arguments.speed:g} of real time:\n\n{table(found)}")
         holds = missed == 0 and np.percentile([one.all_ms for one in found], 99) <= LIMIT_MS
         pressed_n = np.median([one.pressed_n for one in found])
         print(f"\np99 of {LIMIT_MS} ms: {'holds' if holds else 'MISSED'}; it then presses {pressed_n:.2f} N")

@@ -23,6 +23,7 @@ from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, B
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import types as idl
 from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy
 from cyclonedds.topic import Topic
 
 from skinware import DriverReader, DriverSnapshot, Namespace
@@ -215,10 +216,9 @@ def test_nothing_is_published_and_only_one_type_is_asked_for(domain: int) -> Non
     subscriptions = BuiltinDataReader(ours, BuiltinTopicDcpsSubscription)
     with published(domain, case_of("std_msgs/msg/Float32MultiArray")) as program, driven(domain) as skin:
         read_until(skin.reader, is_whole)
-        read = [
-            (one.topic_name, one.type_name) for one in subscriptions.take(100) if not one.topic_name.startswith("DCPS")
-        ]
-        assert read == [("rt/touch", "std_msgs::msg::dds_::Float32MultiArray_")]
+        [reader] = [one for one in subscriptions.take(100) if not one.topic_name.startswith("DCPS")]
+        assert (reader.topic_name, reader.type_name) == ("rt/touch", "std_msgs::msg::dds_::Float32MultiArray_")
+        assert re.fullmatch(rb"\w+=\w+;", reader.qos[Policy.Userdata].data)  # without it, rmw_cyclonedds warns
         assert {one.participant_key for one in publications.take(100)} == {program.participant.guid}
 
 

@@ -76,9 +76,10 @@ class DdsNode:
             if self._waiting is None:
                 self._waiting = WaitingThread(self._participant, self._answer)
             service = _DdsService(reader, writer, handler)
+            del reader  # or ``end`` would keep it
             with self._answering:
                 self._services.append(service)
-            self._waiting.watch(reader)
+            self._waiting.watch(service.reader)
             self._publish_endpoints()
 
         def end() -> None:
@@ -86,7 +87,7 @@ class DdsNode:
                 if service in self._services and self._waiting is not None:
                     with self._answering:
                         self._services.remove(service)
-                    self._waiting.forget(reader)
+                    self._waiting.forget(service.reader)
                     service.close()
                     self._publish_endpoints()
 
@@ -205,12 +206,12 @@ class _DdsWriter:
 
 class _DdsService:
     def __init__(self, reader: DataReader[Any], writer: _DdsWriter, handler: Handler) -> None:
-        self._reader, self._writer, self._handler = reader, writer, handler
+        self.reader, self._writer, self._handler = reader, writer, handler
         self.id: bytes = reader.guid.bytes
 
     def answer(self) -> None:
         try:
-            requests = self._reader.take(_REQUESTS_AT_ONCE)
+            requests = self.reader.take(_REQUESTS_AT_ONCE)
         except DDSException:
             return
         for request in requests:
@@ -221,7 +222,7 @@ class _DdsService:
                 self._writer.publish(answer[:_ENCAPSULATION] + asked[_ENCAPSULATION:after_id] + answer[_ENCAPSULATION:])
 
     def close(self) -> None:
-        del self._reader
+        del self.reader
         self._writer.close()
 
 

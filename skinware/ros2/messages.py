@@ -75,7 +75,6 @@ PARTICIPANT = MessageType(
 OF_SCHEMAS = {each.name: each for each in (POINTS, IMAGE)}
 """Types of point clouds and images, by the names of their definitions."""
 
-
 DISCOVERY_TOPIC = "ros_discovery_info"
 """Where ROS 2 publishes, over DDS, which node has which endpoints."""
 PARTICIPANT_DATA = b"enclave=/;"

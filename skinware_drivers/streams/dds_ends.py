@@ -40,8 +40,7 @@ _AT_ONCE = 16
 """Samples of a topic in one read."""
 _UNREAD_NS = 5 * NS_PER_S
 """Time after which a publisher that no reader has matched is reported."""
-_USER_DATA = b"program=skinware;"
-"""Of readers and writers: nodes of ROS 2 warn of each endpoint without any."""
+_USER_DATA = Policy.Userdata(b"program=skinware;")  # nodes of ROS 2 warn of endpoints without any
 _ALL_BITS = (1 << 64) - 1
 """Handles of matched publishers have a sign, those of samples have none."""
 
@@ -238,7 +237,7 @@ def _joined(name: str, domain: int, options: DdsOptions) -> tuple[Domain | None,
 def _qos(options: DdsOptions, *policies: Any) -> Qos:
     is_reliable = options.qos == "reliable"
     reliability = Policy.Reliability.Reliable(max_blocking_time=0) if is_reliable else Policy.Reliability.BestEffort
-    return Qos(reliability, Policy.Durability.Volatile, Policy.Userdata(_USER_DATA), *policies)
+    return Qos(reliability, Policy.Durability.Volatile, _USER_DATA, *policies)
 
 
 def _topic(participant: DomainParticipant, topic: DdsTopic) -> Any:

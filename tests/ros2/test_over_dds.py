@@ -16,8 +16,12 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the extra ros2")
 
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
 
 from skinware import DriverReader, Namespace
+from skinware.conversion.ros_messages import skin_frame
 from skinware.conversion.showing import in_topic
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.ros2 import cyclone, dds, messages
@@ -71,13 +75,8 @@ def test_a_program_in_the_graph_gets_what_the_driver_publishes(namespace: Namesp
     skin.values[skin.structure.index("pressure")] = np.arange(160)
     with publishing(skin), bridge() as ours:
         told = ours.wait_for("ready")
-        assert told == {
-            "event": "ready",
-            "rmw": "dds",
-            "domain": domain,
-            "node": f"/skinware_{in_topic(namespace.name)}",
-            "namespace": namespace.name,
-        }
+        node = f"/skinware_{in_topic(namespace.name)}"
+        assert told == {"event": "ready", "rmw": "dds", "domain": domain, "node": node, "namespace": namespace.name}
         with peer(domain, "--look", "--listen", *FRAME, "--listen", *POINTS, "--listen-late", *SENSORS) as theirs:
             sensors = message(theirs, *SENSORS)
             assert np.array_equal(sensors.uid, skin.structure.sensor_uid)
@@ -127,6 +126,17 @@ def test_a_service_tares(namespace: Namespace, domain: int) -> None:
             wait_until(lambda: bool((reader.read().values == 2).all()))
 
 
+def test_a_service_that_ends_leaves_the_graph(domain: int) -> None:
+    participant = DomainParticipant(domain)
+    requests = Topic(participant, "rq/tareRequest", dds._type(messages.TRIGGER.request, with_id=True))
+    caller = DataWriter(participant, requests)
+    with contextlib.closing(dds.DdsNode(NodeIdentity("skin", domain=domain))) as node:
+        end = node.service("/tare", messages.TRIGGER, lambda request: request)
+        wait_until(lambda: len(caller.get_matched_subscriptions()) == 1)
+        end()
+        wait_until(lambda: not caller.get_matched_subscriptions())
+
+
 @pytest.mark.thorough
 def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: Namespace, domain: int) -> None:
     """Of a topic whose messages fill what is kept for a reader that acknowledges nothing."""
@@ -157,25 +167,20 @@ def test_a_stopped_and_a_killed_subscriber_cost_nobody_else_anything(namespace: 
 def test_messages_are_the_same_without_the_private_way(monkeypatch: pytest.MonkeyPatch, domain: int) -> None:
     monkeypatch.setattr(cyclone, "write_bytes", None)
     node = dds.DdsNode(NodeIdentity("skin", domain=domain))
-    try:
-        with peer(domain, "--listen", "rt/x", messages.SKIN_FRAME.name) as theirs:
-            publisher = node.publisher("/x", messages.SKIN_FRAME, Qos())
-            assert not publisher.is_wanted or theirs
-            wait_until(lambda: publisher.is_wanted)
-            sent = made_frame()
-            wait_until(lambda: publisher.publish(sent))
-            data = theirs.wait_for("message")["data"]
-            assert base64.b64decode(data)[: len(sent)] == sent
-    finally:
-        node.close()
+    with contextlib.closing(node), peer(domain, "--listen", "rt/x", messages.SKIN_FRAME.name) as theirs:
+        publisher = node.publisher("/x", messages.SKIN_FRAME, Qos())
+        assert not publisher.is_wanted or theirs
+        wait_until(lambda: publisher.is_wanted)
+        sent = made_frame()
+        wait_until(lambda: publisher.publish(sent))
+        data = theirs.wait_for("message")["data"]
+        assert base64.b64decode(data)[: len(sent)] == sent
     assert not publisher.publish(b"")
 
 
 def made_frame() -> bytes:
     with FakeSkin("leg", fake_structure(1, 1)) as skin, DriverReader("leg") as reader:
         skin.publish()
-        from skinware.conversion.ros_messages import skin_frame
-
         return skin_frame(reader.read(), 10**18)
 
 
@@ -217,22 +222,16 @@ def test_this_machine_alone_by_default(domain: int, monkeypatch: pytest.MonkeyPa
     monkeypatch.delenv("CYCLONEDDS_URI")
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     before = udp_addresses()
-    node = dds.DdsNode(NodeIdentity("skin", domain=domain))
-    try:
+    with contextlib.closing(dds.DdsNode(NodeIdentity("skin", domain=domain))):
         assert udp_addresses() - before == {"127.0.0.1"}
-    finally:
-        node.close()
 
 
 @pytest.mark.parametrize("name", ["lo", "127.0.0.1"])
 def test_an_interface_is_chosen_by_name_or_address(name: str, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("CYCLONEDDS_URI")
     before = udp_addresses()
-    node = dds.DdsNode(NodeIdentity("skin", domain=domain), [name])
-    try:
+    with contextlib.closing(dds.DdsNode(NodeIdentity("skin", domain=domain), [name])):
         assert udp_addresses() - before == {"127.0.0.1"}
-    finally:
-        node.close()
     with pytest.raises(BridgeError, match="cannot be joined"):
         dds.DdsNode(NodeIdentity("skin", domain=domain), ["none'0"])
 

@@ -22,7 +22,7 @@ from serial.tools import list_ports
 import skinware.recording
 from skinware import DriverReader, Namespace, Sample, ServiceReader, ServiceWriter, errors, native
 from skinware.bridge.endpoints import endpoints
-from skinware.bridge.link import Link as BridgeLink
+from skinware.bridge.link import ZenohLink
 from skinware.errors import SkinwareError
 from skinware.memory.ring import slot_headers_of
 from skinware.realtime import Profile
@@ -116,7 +116,7 @@ def BridgeError(monkeypatch: pytest.MonkeyPatch) -> object:  # noqa: N802
         )
 
     monkeypatch.setattr(zenoh, "open", fail)
-    return BridgeLink(endpoints(listen=[place]))
+    return ZenohLink(endpoints(listen=[place]))
 
 
 @produces

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from skinware.bridge.link import Guard, Link, Priority
+from skinware.bridge.link import Guard, Priority, ZenohLink
 from skinware.bridge.messages import Keys
 from skinware.errors import BridgeError
 from skinware.limits import LIMITS
@@ -139,7 +139,7 @@ class Pinger:
     come, when the next round begins.
     """
 
-    def __init__(self, link: Link, who: str, on_sample: Callable[[Exchange], None], guard: Guard) -> None:
+    def __init__(self, link: ZenohLink, who: str, on_sample: Callable[[Exchange], None], guard: Guard) -> None:
         self._link, self.who, self._on_sample, self._guard = link, who, on_sample, guard
         self._ping = ""
         self._end_listening: Callable[[], None] = lambda: None
@@ -196,7 +196,7 @@ class Pinger:
             self._report()
 
 
-def answer_pings(link: Link, keys: Keys, clock: Callable[[], int] = now_ns) -> Callable[[], None]:
+def answer_pings(link: ZenohLink, keys: Keys, clock: Callable[[], int] = now_ns) -> Callable[[], None]:
     """Answer questions for the time of a clock; return a function that ends it."""
 
     def asked(_key: str, message: bytes) -> None:

@@ -11,7 +11,7 @@ import msgspec
 
 from skinware.bridge.clock import PeerClock
 from skinware.bridge.following import ServiceFollower
-from skinware.bridge.link import Link, Priority
+from skinware.bridge.link import Priority, ZenohLink
 from skinware.bridge.messages import CallResult, Keys, Service, Services, Wish, read_text
 from skinware.bridge.mirror import Mirror
 from skinware.bridge.peer import SLOWEST_ANSWER_S, Change, Jobs, Peer
@@ -40,7 +40,7 @@ class Joiner:
     def __init__(
         self,
         robot: str,
-        link: Link,
+        link: ZenohLink,
         namespace: Namespace,
         *,
         mode: str | None = None,

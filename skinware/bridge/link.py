@@ -117,7 +117,7 @@ class Sender:
         return bool(status.matching)
 
 
-class Link:
+class ZenohLink:
     """A session of zenoh; BridgeError says why it cannot be opened."""
 
     def __init__(self, endpoints: Endpoints) -> None:

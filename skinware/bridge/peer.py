@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, Literal
 
 from skinware.bridge.clock import Exchange, PeerClock, Pinger
-from skinware.bridge.link import Guard, Link
+from skinware.bridge.link import Guard, ZenohLink
 from skinware.bridge.messages import ALL_TOKENS, VERSION, Keys, Services, token_parts
 from skinware.errors import BridgeError
 from skinware.realtime import NS_PER_S, now_ns
@@ -116,7 +116,7 @@ class Peer:
     def __init__(
         self,
         robot: str,
-        link: Link,
+        link: ZenohLink,
         jobs: Jobs,
         changed: Callable[[Change], None],
         *,
@@ -148,7 +148,7 @@ class Peer:
         answered: Callable[[bytes | None, int], None],
         **how: Any,
     ) -> None:
-        """Ask as :meth:`skinware.bridge.link.Link.ask`; a job calls ``answered(answer, when it came)``."""
+        """Ask as :meth:`skinware.bridge.link.ZenohLink.ask`; a job calls ``answered(answer, when it came)``."""
 
         def came(answer: bytes | None) -> None:
             self.soon("an answer", partial(answered, answer, now_ns()), len(answer or b""))
@@ -156,7 +156,7 @@ class Peer:
         self._link.ask(key, came, **how)
 
     def listen(self, key: str, heard: Callable[[str, bytes], None]) -> Callable[[], None]:
-        """Listen as :meth:`skinware.bridge.link.Link.listen`, in the receiving thread."""
+        """Listen as :meth:`skinware.bridge.link.ZenohLink.listen`, in the receiving thread."""
         return self._link.listen(key, partial(self.guard.run, "a frame", heard))
 
     def soon(self, kind: str, work: Callable[[], object], size: int = 0) -> None:

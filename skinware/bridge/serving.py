@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 import msgspec
 
 from skinware.bridge.clock import answer_pings
-from skinware.bridge.link import Guard, Link, Question
+from skinware.bridge.link import Guard, Question, ZenohLink
 from skinware.bridge.messages import (
     About,
     CallResult,
@@ -99,7 +99,7 @@ class Server:
     def __init__(
         self,
         robot: str,
-        link: Link,
+        link: ZenohLink,
         namespace: Namespace,
         names: Collection[str] | None = None,
         *,

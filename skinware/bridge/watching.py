@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from skinware.bridge.clock import Exchange, PeerClock, Pinger
-from skinware.bridge.link import Guard, Link, Sender
+from skinware.bridge.link import Guard, Sender, ZenohLink
 from skinware.bridge.messages import (
     ALL_SUMMARIES,
     ALL_TOKENS,
@@ -131,7 +131,7 @@ class Watcher:
         guard: counts messages that cannot be read and belong to no known robot.
     """
 
-    def __init__(self, link: Link, *, asks: bool = True) -> None:
+    def __init__(self, link: ZenohLink, *, asks: bool = True) -> None:
         self._link, self._asks, self._who = link, asks, os.urandom(8).hex()
         self._lock = threading.Lock()
         self._seen: dict[tuple[str, str], Seen] = {}  # by robot and instance

@@ -81,7 +81,7 @@ def route(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.bridge.endpoints import DEFAULT_ROUTER, Rules, endpoints
-    from skinware.bridge.link import Link
+    from skinware.bridge.link import ZenohLink
     from skinware.bridge.watching import Watcher
 
     places = endpoints(
@@ -91,7 +91,7 @@ def route(
         rules=Rules(callers, True, robots, routers),
         insecure=insecure,
     )
-    with contextlib.closing(Link(places)) as link:
+    with contextlib.closing(ZenohLink(places)) as link:
         watcher = Watcher(link, asks=False)
         with cli.signals_end(watcher.stop):
             ready = {"event": "ready", "listen": list(places.listen), "connect": list(places.connect)}
@@ -130,11 +130,11 @@ def list_robots(connect: tuple[str, ...], tls: Path | None, watch: bool, as_json
     Exit status: 0 done or interrupted, 1 no robot reached, 2 wrong usage.
     """
     from skinware.bridge.endpoints import endpoints, why_unreachable
-    from skinware.bridge.link import Link
+    from skinware.bridge.link import ZenohLink
     from skinware.bridge.watching import Watcher
 
     places = endpoints(connect=connect, tls=tls)
-    with contextlib.closing(Link(places)) as link:
+    with contextlib.closing(ZenohLink(places)) as link:
         watcher, seconds = Watcher(link), itertools.count(1)
 
         def report() -> None:

@@ -78,7 +78,7 @@ def serve(
     Exit status: 0 interrupted, 1 failed, 2 wrong usage.
     """
     from skinware.bridge.endpoints import DEFAULT_LISTEN, Rules, endpoints
-    from skinware.bridge.link import Link
+    from skinware.bridge.link import ZenohLink
     from skinware.bridge.messages import Keys
     from skinware.bridge.serving import Server
     from skinware.memory.namespace import Namespace, check_name
@@ -94,7 +94,7 @@ def serve(
         rules=Rules(callers),
         insecure=insecure,
     )
-    with contextlib.closing(Link(places)) as link:
+    with contextlib.closing(ZenohLink(places)) as link:
         server = Server(robot, link, place, names or None, callers=callers)
         with contextlib.closing(server), cli.signals_end(server.stop):
             ready = {"event": "ready", "robot": robot, "namespace": place.name}
@@ -159,7 +159,7 @@ def join(
     """
     from skinware.bridge.endpoints import endpoints, why_unreachable
     from skinware.bridge.joining import Joiner
-    from skinware.bridge.link import Link
+    from skinware.bridge.link import ZenohLink
     from skinware.bridge.messages import Keys, Wish
     from skinware.bridge_state import as_data
     from skinware.memory.namespace import Namespace
@@ -169,7 +169,7 @@ def join(
     Keys(robot)  # refuses a wrong name before anything is opened
     place = Namespace(into or robot)
     places = endpoints(connect=connect, tls=tls)
-    with contextlib.closing(Link(places)) as link:
+    with contextlib.closing(ZenohLink(places)) as link:
         joiner = Joiner(
             robot,
             link,

@@ -26,7 +26,7 @@ if find_spec("zenoh") is None or find_spec("xxhash") is None:
     raise MissingExtra.of("a bus ros2", "skinware[ros2-zenoh]")
 
 from skinware.bridge.endpoints import DEFAULT_ROUTER
-from skinware.bridge.link import Link
+from skinware.bridge.link import ZenohLink
 from skinware.ros2.rmw_zenoh import MessageAttachment, gid, graph_endpoints
 
 _TOKEN_PARTS, _MOST_TOKENS = 13, 8192
@@ -95,7 +95,7 @@ class ZenohPort(TopicPort):
         self._event = -1
         self._waking = threading.Lock()  # zenoh's threads may still wake what is being closed
         try:
-            self._link = Link(graph_endpoints(options.router))
+            self._link = ZenohLink(graph_endpoints(options.router))
         except BridgeError as error:
             raise BusNotAvailable(f"{name}: {error}") from None
         self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from skinware.bridge.link import Link, Question, Sender
+from skinware.bridge.link import Question, Sender, ZenohLink
 
 
 def _match(one: str, other: str) -> bool:
@@ -85,7 +85,7 @@ class _Sender(Sender):
         return [heard for pattern, heard in list(self._net.listeners) if _match(self._key, pattern)]
 
 
-class NetLink(Link):
+class NetLink(ZenohLink):
     def __init__(self, net: Net) -> None:
         self._net = net
         self._own: list[str] = []

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from skinware.bridge.clock import Exchange
-from skinware.bridge.link import Link
+from skinware.bridge.link import ZenohLink
 from skinware.bridge.peer import Jobs, Peer
 from skinware.realtime import NS_PER_S, now_ns
 
@@ -26,7 +26,7 @@ class NoLink:
 def test_a_robot_behind_a_delay_that_has_grown_stays_connected() -> None:
     jobs = Jobs()
     events: list[dict[str, Any]] = []
-    peer = Peer("icub", cast(Link, NoLink()), jobs, lambda _: None, why_not=str, on_event=events.append)
+    peer = Peer("icub", cast(ZenohLink, NoLink()), jobs, lambda _: None, why_not=str, on_event=events.append)
     begun = now_ns()
     for number, round_trip_ms in enumerate([1] * 20 + [600] * 3):
         at_ns = begun + 500 * MS * number

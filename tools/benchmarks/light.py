@@ -22,7 +22,7 @@ from record import BUS_COUNTERS, LEVELS, NOISE, PATCH_COUNTERS, structure_of
 from skinware import DriverWriter
 from skinware.bridge.endpoints import Rules, endpoints
 from skinware.bridge.joining import Joiner
-from skinware.bridge.link import Link
+from skinware.bridge.link import ZenohLink
 from skinware.bridge.serving import Server
 from skinware.bridge_state import ServiceState
 from skinware.memory.namespace import Namespace
@@ -143,7 +143,7 @@ class Account:
 class WatchedJoiner(Joiner):
     """A joiner that keeps what came, which it forgets each second once it was told."""
 
-    def __init__(self, robot: str, link: Link, namespace: Namespace, *, mode: str) -> None:
+    def __init__(self, robot: str, link: ZenohLink, namespace: Namespace, *, mode: str) -> None:
         super().__init__(robot, link, namespace, mode=mode)
         self._came = Account()
 
@@ -180,7 +180,9 @@ def be_robots(pipe: Connection, place: str | None, robots: list[Robot], sensors:
         skins = []
         for robot in robots:
             skins.append(stack.enter_context(LightSkin(robot.there, sensors, rate_hz)))
-            link = stack.enter_context(closing(Link(endpoints(listen=[robot.listen], rules=Rules(), insecure=True))))
+            link = stack.enter_context(
+                closing(ZenohLink(endpoints(listen=[robot.listen], rules=Rules(), insecure=True)))
+            )
             server = stack.enter_context(closing(Server(robot.name, link, Namespace(robot.there))))
             stack.enter_context(_running(server))
         pipe.send("ready")
@@ -203,7 +205,7 @@ def be_desk(pipe: Connection, place: str | None, robots: list[Robot], mode: str)
     with ExitStack() as stack:
         joiners: list[WatchedJoiner] = []
         for robot in robots:
-            link = stack.enter_context(closing(Link(endpoints(connect=[robot.connect]))))
+            link = stack.enter_context(closing(ZenohLink(endpoints(connect=[robot.connect]))))
             joiner = stack.enter_context(closing(WatchedJoiner(robot.name, link, Namespace(robot.here), mode=mode)))
             stack.enter_context(_running(joiner))
             joiners.append(joiner)

@@ -42,6 +42,7 @@
 #define GAIN_LASTS_S 604800.0 /* seconds, a week, in which a known gain becomes as uncertain as that: skins age */
 #define LEAST_GAIN 0.1f       /* with less, something else moves the taxel */
 #define MOST_GAIN 3.0f        /* with more, too */
+#define QUIET 0.15f           /* share of the typical variance of noise of a patch: with less, a taxel is dead */
 #define FEW_TAXELS 3.0        /* free taxels of a patch of which nothing is common */
 #define MANY_TAXELS 20.0      /* free taxels of a patch that no touch covers evenly but for a hand that slams on all of it */
 #define NEARLY_ALL 0.85       /* share of them that has to move alike where the mode jumps */

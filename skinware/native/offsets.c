@@ -56,7 +56,7 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
     for (i = first; i < last; i++) {
         const float lowest_rest = low * sqrtf(a.noise2[i]), since_s = a.since_end_s[i];
         const float least = a.below[i] ? lowest_rest : -INFINITY;
-        a.flag[i] = (a.smooth[i] >= least ? since_s : 0.0f) >= SETTLED_S;
+        a.flag[i] = ((a.smooth[i] >= least ? since_s : 0.0f) >= SETTLED_S) & (a.noise2[i] >= QUIET * typical);
     }
     INDEPENDENT
     for (i = first; i < last; i++)
@@ -64,7 +64,7 @@ static void sum_run(struct baseline *b, const struct run *run, struct patch *p) 
     INDEPENDENT
     for (i = first; i < last; i++) {
         const float on = a.on[i], hidden2 = a.held[i] ? on * on : 0.0f;
-        const float own = highest(a.noise2[i], typical) + a.variance[i]; /* a dead taxel does not count for more */
+        const float own = highest(a.noise2[i], typical) + a.variance[i]; /* a quiet taxel does not count for more */
         const float limit = 2.0f * sqrtf(own + a.gain[i] * a.gain[i] * common);
         const float weight = 1.0f / (own + hidden2), clipped = within(a.deviation[i], limit) * weight;
         a.scratch[i] = a.flag[i] ? weight : 0.0f;
@@ -271,8 +271,9 @@ static void tick(struct baseline *b, double passed_s) {
     for (i = 0; i < b->n; i++) { /* the gains and the mode must not float apart */
         const struct patch *p = &b->patches[b->patch[i]];
         const float ratio = (float)(p->sums[1] > 0 ? p->sums[0] / fmax(p->sums[1], 1e-9) : 1);
+        const float least = b->noise2[i] < QUIET * (float)p->noise2 ? 0.0f : LEAST_GAIN;
         b->gain[i] *= b->flag[i] ? ratio : 1.0f;
-        b->gain[i] = lowest(highest(b->gain[i], LEAST_GAIN), MOST_GAIN);
+        b->gain[i] = lowest(highest(b->gain[i], least), MOST_GAIN);
         b->gain_before[i] = b->gain[i];
     }
     follow_speeds(b);

@@ -217,7 +217,7 @@ static void begin(struct baseline *b, int64_t taxel, const measured *found) {
         block_at(b, block)[COUNT * b->n + taxel] = 0; /* else it would begin again while others wait */
     b->level[taxel] = found->level;
     b->noise2[taxel] = noise2;
-    b->gain[taxel] = b->gain_before[taxel] = lowest(highest(found->gain, LEAST_GAIN), MOST_GAIN);
+    b->gain[taxel] = b->gain_before[taxel] = lowest(highest(found->gain, 0), MOST_GAIN);
     b->gain_variance[taxel] = found->gain_variance;
     b->variance[taxel] = noise2 / 20;
     b->cross[taxel] = b->slow[taxel] = 0;

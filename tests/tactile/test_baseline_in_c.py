@@ -202,12 +202,11 @@ def test_a_module_that_is_looked_at_again_while_a_touch_begins_on_it(later: int,
     both.compare_states()
 
 
-@pytest.mark.parametrize(("dead", "speed"), [(0, 100), (20, 100), (20, 2250)])
-def test_taxels_without_noise_say_no_more_of_a_drift_and_make_no_others_begin_again(dead: int, speed: int) -> None:
+@pytest.mark.parametrize(("dead", "speed"), [(0, 100), (20, -300), (20, 2250)])
+def test_dead_taxels_are_not_touched_in_a_drift_and_let_no_others_be(dead: int, speed: int) -> None:
     """Values of 24 bits, whose noise is small beside their drift. Beside a quick one, dead taxels seem to move."""
     random, both = np.random.default_rng(1), Both(np.arange(N) // 12, np.zeros(N, int))
     gain = 1 + 0.25 * random.standard_normal(N)
     for number in range(600):
-        signal = speed * number * gain + 6e3 * random.standard_normal(N)
-        calm = both.update(number * _STEP_NS // 20, 2.5e6 + np.where(np.arange(N) < dead, 0, signal))
-        assert not calm.touched[dead:].any(), f"{number / 20} s"
+        values = 2.5e6 + (np.arange(N) >= dead) * (speed * number * gain + 6e3 * random.standard_normal(N))
+        assert not both.update(number * _STEP_NS // 20, values).touched.any()

@@ -27,6 +27,7 @@ from tests.specification.baseline.numbers import (
     MOST_DRIFT,
     MOST_GAIN,
     NOISE_S,
+    QUIET,
     RATE_S,
     SLOW_S,
     TICK_S,
@@ -110,9 +111,8 @@ class CommonMode:
         trust = np.where(known, 1 - FEW_TAXELS / np.maximum(free, 1), 0)
         self.variance += self.agility * passed_s
         unknown = ~known
-        if unknown.any():
-            self.variance[unknown] += self.rate2[unknown] * (2 * self.unknown_s[unknown] + passed_s) * passed_s
-            self.unknown_s[unknown] += passed_s
+        self.variance[unknown] += self.rate2[unknown] * (2 * self.unknown_s[unknown] + passed_s) * passed_s
+        self.unknown_s[unknown] += passed_s
         self.unknown_s[known] = 0
         total = self.variance + 1 / np.maximum(precision, 1e-30)
         most = DRIFT_SIGMA * np.sqrt(total)
@@ -203,7 +203,9 @@ class Offsets:
         """
         if passed_s <= 0:
             return
-        own = np.maximum(self.noise2, self.patches.spread(self.typical)) + self.variance
+        typical = self.patches.spread(self.typical)
+        free = free & (self.noise2 >= np.float32(QUIET) * typical)
+        own = np.maximum(self.noise2, typical) + self.variance
         weight = np.where(free, np.float32(1) / (own + hidden2), np.float32(0))
         limit = np.float32(2) * np.sqrt(own + self.gain * self.gain * self.patches.spread(self.common.variance))
         clipped = np.minimum(np.maximum(deviation, -limit), limit)
@@ -213,8 +215,7 @@ class Offsets:
         precision = reach * reach / weights
         found = self.patches.sum(clipped * weight) / reach
         move, sure = self.common.step(found, precision, self.patches.sum(free), passed_s)
-        moved = self.patches.spread(move)
-        change = self.gain * moved
+        change = self.gain * self.patches.spread(move)
         self.level += change
         deviation -= change
         moved = self.patches.spread(sure)
@@ -271,11 +272,10 @@ class Offsets:
         self._unseen_s = np.where(taxels, np.float32(0), self._unseen_s + passed)
         averages = np.float32(-math.expm1(-passed_s / WANDER_S))
         self._speed += (share * innovation / np.float32(passed_s) - self._speed) * (averages * (taxels & fresh))
-        quick2 = quick * (innovation - self.slow)
         self.noise_s = np.minimum(self.noise_s + calm * np.float32(passed_s), np.float32(NOISE_S))
         with np.errstate(divide="ignore"):
             of_square = np.minimum(np.float32(passed_s) / self.noise_s, np.float32(FEWEST))
-        self.noise2 += (quick2 - self.noise2) * (calm * of_square)
+        self.noise2 += (quick * (innovation - self.slow) - self.noise2) * (calm * of_square)
         self._tick_s += passed_s
         if self._tick_s >= TICK_S:
             self._tick(taxels, live, passed_s)
@@ -306,7 +306,8 @@ class Offsets:
         )
         ratio = self.patches.spread(np.where(now > 0, before / np.maximum(now, 1e-9), 1))
         self.gain *= np.where(taxels, ratio, np.float32(1))  # they and the mode must not float apart
-        np.clip(self.gain, LEAST_GAIN, MOST_GAIN, out=self.gain)
+        dead = self.noise2 < np.float32(QUIET) * self.patches.spread(self.typical)
+        np.clip(self.gain, np.where(dead, np.float32(0), np.float32(LEAST_GAIN)), MOST_GAIN, out=self.gain)
         self._gain_before = self.gain.copy()
         self._follow_speeds(live)
 
@@ -323,7 +324,7 @@ class Offsets:
     def begin(self, taxels: Rows, level: Floats, noise2: Floats, gain: Floats, gain_variance: Floats) -> None:
         """Give k taxels what was measured of them: levels, noise and gains (k,)."""
         self.level[taxels], self.noise2[taxels] = level, noise2
-        self.gain[taxels] = self._gain_before[taxels] = np.clip(gain, LEAST_GAIN, MOST_GAIN)
+        self.gain[taxels] = self._gain_before[taxels] = np.clip(gain, 0, MOST_GAIN)
         self.gain_variance[taxels] = gain_variance
         self.variance[taxels], self.cross[taxels], self.slow[taxels] = noise2 / 20, 0, 0
 

@@ -37,8 +37,8 @@ _SERVICE_QOS = Qos(depth=10)
 _REQUESTS_AT_ONCE = 16
 _ENCAPSULATION = 4
 _REQUEST_ID = {"guid": idl.uint64, "sequence": idl.int64}
-_REQUEST_ID_SIZE = 16
-"""Size of the header that rmw_cyclonedds writes before requests and responses."""
+_AFTER_ID = _ENCAPSULATION + 16
+"""End of the header that rmw_cyclonedds writes before requests and responses."""
 
 
 class DdsNode:
@@ -217,9 +217,8 @@ class _DdsService:
         for request in requests:
             if isinstance(request, IdlStruct):  # otherwise the peer is gone
                 asked = request.serialize()
-                after_id = _ENCAPSULATION + _REQUEST_ID_SIZE
-                answer = self._handler(asked[:_ENCAPSULATION] + asked[after_id:])
-                self._writer.publish(answer[:_ENCAPSULATION] + asked[_ENCAPSULATION:after_id] + answer[_ENCAPSULATION:])
+                reply = self._handler(asked[:_ENCAPSULATION] + asked[_AFTER_ID:])
+                self._writer.publish(reply[:_ENCAPSULATION] + asked[_ENCAPSULATION:_AFTER_ID] + reply[_ENCAPSULATION:])
 
     def close(self) -> None:
         del self.reader

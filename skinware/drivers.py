@@ -144,7 +144,9 @@ class Drivers(Generic[ReaderT]):
         Returns:
             None if there is no newer one, the service has just restarted, or is not followed any more.
         """
-        reader = self.keep_up(name)
+        reader = self.readers.get(name)
+        if reader is None or newer_than is None or reader.newest_position in (None, newer_than.position):
+            reader = self.keep_up(name)  # which looks at the file
         newest = None if reader is None else reader.newest_position
         if reader is None or newest is None or (newer_than is not None and newest == newer_than.position):
             return None

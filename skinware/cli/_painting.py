@@ -71,25 +71,14 @@ _GROUND = ColorTriplet(18, 18, 18)
 """Colour of the screen."""
 _BLACK, _WHITE = ColorTriplet(0, 0, 0), ColorTriplet(255, 255, 255)
 _VIRIDIS = tuple(
-    Color.parse(text).get_truecolor()
-    for text in (
-        "#482475",
-        "#443780",
-        "#3f4988",
-        "#375a8c",
-        "#31698d",
-        "#2a788e",
-        "#25878d",
-        "#21968a",
-        "#22a386",
-        "#30b17c",
-        "#44bf70",
-        "#64ca5d",
-        "#87d448",
-        "#b0dc2f",
-        "#d7e226",
-        "#fde725",
-    )
+    ColorTriplet(*rgb.tolist())
+    for rgb in np.frombuffer(
+        bytes.fromhex(
+            "482475 443780 3f4988 375a8c 31698d 2a788e 25878d 21968a"
+            "22a386 30b17c 44bf70 64ca5d 87d448 b0dc2f d7e226 fde725"
+        ),
+        np.uint8,
+    ).reshape(-1, 3)
 )
 """One colour for each level."""
 _BASIC = {

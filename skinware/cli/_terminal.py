@@ -16,6 +16,7 @@ import stat
 import sys
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Iterator
 from typing import Any, TextIO
@@ -28,6 +29,7 @@ from skinware.text import plural, printable
 _MOST_WAITING = 1 << 20
 """Bytes that may wait to be read; later text is left out."""
 _SLICE = select.PIPE_BUF
+_LOOKS_FOR_KEYS = 4
 _AT_THE_END_S = 1.0
 """Time that the end of a command waits for a reader."""
 
@@ -260,3 +262,28 @@ def json_text(data: object) -> str:
 class Formatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         return shown(super().format(record))
+
+
+class EndOfKeys(threading.Event):
+    """Says whether the thread that reads keys shall end; while there are none, that thread sleeps in ``is_set``.
+
+    Textual asks ten times a second, and after a key it may, for a while: an escape alone is a key, too.
+    """
+
+    def __init__(self, keys: int) -> None:
+        super().__init__()
+        self._bell, self._poll, self._looks = os.eventfd(0, os.EFD_NONBLOCK), select.poll(), 0
+        weakref.finalize(self, os.close, self._bell)
+        for descriptor in (keys, self._bell):
+            self._poll.register(descriptor, select.POLLIN)
+
+    def is_set(self) -> bool:
+        if threading.current_thread() is not threading.main_thread() and not super().is_set():
+            if not self._looks:
+                self._poll.poll()
+            self._looks = (self._looks or _LOOKS_FOR_KEYS) - 1
+        return super().is_set()
+
+    def set(self) -> None:
+        super().set()
+        os.eventfd_write(self._bell, 1)

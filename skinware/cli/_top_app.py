@@ -14,12 +14,14 @@ from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Container, Horizontal, Vertical, VerticalScroll
+from textual.drivers.linux_driver import LinuxDriver
 from textual.screen import ModalScreen, Screen
 from textual.widgets import Footer, Static
 
 from skinware.bridge_state import as_data, summary
 from skinware.cli._painting import MARK_CHARACTERS, MARK_NAMES, HeatMap, Palette, palette_for
 from skinware.cli._picture import CHANGE, Picture, describe_sensor
+from skinware.cli._terminal import EndOfKeys
 from skinware.cli._top_list import DriverList
 from skinware.cli._top_rows import COLUMNS, ListRow, labels_of, lines_of, rows_of
 from skinware.driver_snapshot import DriverSnapshot
@@ -53,8 +55,6 @@ Start one in another terminal, for example:
   skin-driver --bus can0       ROBOSKIN patches on a CAN bus
 
 It appears here when it runs.  q quits."""
-
-
 _MEANINGS = (
     "a driver, its buses, and the patches on each",
     "live, or what is wrong; a driver that hangs is silent",
@@ -168,10 +168,10 @@ class SkinTop(App[None]):
         Binding("down", "choose(1)", "Choose", key_display="↑↓"),
         Binding("up", "choose(-1)", show=False),
         Binding("t", "next_type", "Type"),
-        Binding("s", "next_scale", "Scale"),
-        Binding("r", "next_region", "Region"),
+        Binding("s", "picture('next_scale')", "Scale"),
+        Binding("r", "picture('next_region')", "Region"),
         Binding("o", "next_order", "Order"),
-        Binding("b", "take_baselines", "Baseline"),
+        Binding("b", "picture('take_baselines')", "Baseline"),
         Binding("pagedown", "scroll(1)", "Scroll", key_display="PgUp/PgDn"),
         Binding("pageup", "scroll(-1)", show=False),
     ]
@@ -227,6 +227,8 @@ class SkinTop(App[None]):
         for number in _ENDING_SIGNALS:
             with contextlib.suppress(ValueError, RuntimeError):  # not in the main thread
                 loop.add_signal_handler(number, self.exit)
+        if isinstance(self._driver, LinuxDriver):
+            self._driver.exit_event = EndOfKeys(self._driver.fileno)
         self._update_list()
         self.set_interval(_LIST_PERIOD_S, self._update_list)
         self._following = asyncio.create_task(self._follow())
@@ -241,7 +243,7 @@ class SkinTop(App[None]):
         self._overview.close()
 
     def action_choose(self, step: int) -> None:
-        self._list.move(step)
+        self._list.choose(min(max(self._list.cursor + step, 0), len(self._list.rows) - 1))
 
     def action_next_order(self) -> None:
         self._is_worst_first = not self._is_worst_first
@@ -261,18 +263,10 @@ class SkinTop(App[None]):
             self._draw_soon()
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:  # noqa: ARG002 - Textual's
-        return self._picture.regions is not None or action != "next_region"
+        return self._picture.regions is not None or parameters != ("next_region",)
 
-    def action_next_scale(self) -> None:
-        self._picture.next_scale()
-        self._draw_soon()
-
-    def action_next_region(self) -> None:
-        self._picture.next_region()
-        self._draw_soon()
-
-    def action_take_baselines(self) -> None:
-        self._picture.take_baselines()
+    def action_picture(self, change: str) -> None:
+        getattr(self._picture, change)()
         self._draw_soon()
 
     def on_driver_list_row_chosen(self) -> None:

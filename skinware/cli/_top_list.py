@@ -67,10 +67,6 @@ class DriverList(TextLines):
             self.changed(1 + n for n, (row, old) in enumerate(zip(rows, before, strict=True)) if row != old)
         self._go(at)
 
-    def move(self, step: int) -> None:
-        """Choose a row below (or above, below 0)."""
-        self.choose(min(max(self.cursor + step, 0), len(self.rows) - 1))
-
     def choose(self, at: int) -> None:
         if 0 <= at < len(self.rows):
             self._wanted = self.rows[at].key

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
+from queue import SimpleQueue
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -25,6 +28,7 @@ from skinware.cli._painting import (
     Palette,
 )
 from skinware.cli._picture import CHANGE, RANGE
+from skinware.cli._terminal import EndOfKeys
 from skinware.cli._top_app import KEYS, Help, SkinTop
 from skinware.cli._top_list import DriverList, room_for
 from skinware.cli._top_rows import COLUMNS
@@ -32,6 +36,7 @@ from skinware.realtime import now_ns
 from skinware.status import Why
 from skinware.tactile.regions import Region, Regions
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
+from tests.commands import PATIENCE_S
 
 SIZES = [(80, 24), (160, 48), (40, 12), (20, 6), (240, 70)]
 
@@ -474,3 +479,24 @@ def test_a_question_mark_explains_every_column_mark_and_key(size: tuple[int, int
                 assert listed(app)[:1] == ["a live"]
 
     go(scene)
+
+
+def test_the_thread_of_keys_sleeps_until_there_is_one_or_it_shall_end() -> None:
+    keys, answers = os.eventfd(0), SimpleQueue[bool]()
+    end = EndOfKeys(keys)
+
+    def ask() -> None:
+        answers.put(end.is_set())
+        os.eventfd_read(keys)
+        while not end.is_set():
+            answers.put(False)
+        answers.put(True)
+
+    thread = Thread(target=ask)
+    thread.start()
+    os.eventfd_write(keys, 1)
+    found = [answers.get(timeout=PATIENCE_S) for _ in range(4)]  # Textual makes keys of bytes meanwhile
+    end.set()
+    thread.join()
+    assert [*found, answers.get()] == [False, False, False, False, True]
+    os.close(keys)

@@ -64,6 +64,7 @@ def test_it_stands_still_zooms_and_has_a_cursor(sleeve: Sleeve, address: str, op
     page = open_page(f"{address}#theme=dark&names=0")
     until(page, READY)
     plotted(page, int(sleeve.taxels[333]))
+    until(page, f"{LINE}.times.at(-1) - {LINE}.times[0] > 1e9")  # a step of the cursor goes back by half a second
     page.keyboard.press("m")
     until(page, "skin.marks[0]?.text === 'mark 1'")
     page.keyboard.press("Space")

@@ -26,7 +26,7 @@ from skinware.views.robot import Robot
 from skinware.views.scene import Scene
 
 _JUDGE_EVERY_NS = NS_PER_S // 5
-_LOOK_EVERY_NS = NS_PER_S // 2
+_LOOK_EVERY_NS = NS_PER_S
 """Between two looks for services of all kinds, one after the other: what came first warms the caches for the others."""
 _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
@@ -169,13 +169,10 @@ class ShownDriver:
         report = report_of(
             live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status
         )
-        if self._stands_still(life_of(live.reader, self.frame)):
+        if self.origin.recording is not None and life_of(live.reader, self.frame) == PAUSED:
             patches = tuple(replace(patch, rate_hz=None, age_ns=None) for patch in report.patches)
             report = replace(report, rate_hz=None, age_ns=None, patches=patches)
         return report
-
-    def _stands_still(self, life: str) -> bool:
-        return life == PAUSED and self.origin.recording is not None
 
     def take(self, frame: DriverSnapshot) -> None:
         if frame.structure is not self.structure and frame.structure != self.structure:
@@ -197,7 +194,7 @@ class ShownDriver:
         if before is None or now_ns() - self._judged_ns < _JUDGE_EVERY_NS:
             return
         before_life, life = self.life, life_of(self.live.reader, before.frame)
-        stands_still = self._stands_still(life)
+        stands_still = life == PAUSED and self.origin.recording is not None
         self.life = before_life if stands_still else life
         self.newest = self._judged(before.frame, before.status if stands_still else status_now(life, before.frame))
         if (
@@ -244,10 +241,7 @@ class Follower:
         self.robot = robot or Robot()
         self.scene = Scene({}, self.robot.poses)
         self._numbers: dict[tuple[str, str], int] = {}
-
-    @property
-    def namespace(self) -> Namespace:
-        return self.origins[0].namespace
+        self._found: list[list[LiveDriver]] = []
 
     def get(self, number: int) -> ShownDriver | None:
         return next((driver for driver in self.drivers if driver.number == number), None)
@@ -266,16 +260,18 @@ class Follower:
         """
         self.problem = None
         try:
-            found = [(live, origin) for origin in self.origins for live in origin.look()]
+            found = [origin.look() for origin in self.origins]
         except NamespaceError as error:
             self.problem = str(error)
             return []
-        if [driver.live for driver in self.drivers] != [live for live, _ in found]:
+        if self._found != found:
+            self._found = found
             kept = {id(driver.live): driver for driver in self.drivers}
             gone, self.drivers = self.drivers, []
-            for live, origin in found:
-                number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
-                self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
+            for origin, lives in zip(self.origins, found, strict=True):
+                for live in lives:
+                    number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
+                    self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
             for driver in gone:
                 if driver not in self.drivers:
                     driver.close()

@@ -119,21 +119,15 @@ class RecentValues:
 
     def series(self, position: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
         """Return (k,) int64 ns and (k,) raw values of a sensor in the ten seconds before the newest snapshot."""
-        rows = self._rows()
+        rows = np.arange(max(0, self._count - _FRAMES), self._count) % _FRAMES
+        times = self._time_ns[rows]
+        rows = rows[times >= times.max(initial=0) - LENGTH_S * NS_PER_S]
         return self._time_ns[rows], self._values[rows, position]
 
     def noise(self, position: int) -> float:
         """Return the standard deviation of raw values of a sensor between snapshots; NaN before the third."""
         values = self.series(position)[1].astype(np.float64)
         return float(np.diff(values).std()) / math.sqrt(2) if len(values) > 2 else math.nan
-
-    def _rows(self) -> npt.NDArray[np.int64]:
-        rows = np.arange(max(0, self._count - _FRAMES), self._count) % _FRAMES
-        if not len(rows):
-            return rows
-        times = self._time_ns[rows]
-        recent: npt.NDArray[np.int64] = rows[times >= times[-1] - LENGTH_S * NS_PER_S]
-        return recent
 
 
 class WipeTest:

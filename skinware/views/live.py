@@ -156,17 +156,18 @@ class LiveDrivers:
     def __init__(self, namespace: Namespace, names: Collection[str] = (), *, every_ns: int | None = None) -> None:
         self.namespace = namespace
         self._drivers = Drivers(namespace, DriverReader, names or None, every_ns=every_ns)
-        self._live: dict[str, LiveDriver] = {}
+        self._all: list[LiveDriver] = []
 
     def get(self, name: str) -> LiveDriver | None:
-        return self._live.get(name)
+        return next((live for live in self._all if live.name == name), None)
 
     def look(self) -> list[LiveDriver]:
-        self._drivers.look()
+        """Return all drivers, the same list while they are the same."""
+        if self._drivers.look():
+            self._keep()
         if self._drivers.trouble:
             raise NamespaceError(self._drivers.trouble)
-        self._keep()
-        return list(self._live.values())
+        return self._all
 
     def poll(self, driver: LiveDriver) -> bool:
         """Take the newest snapshot of a driver, and return whether there was a newer one. It never waits."""
@@ -179,13 +180,13 @@ class LiveDrivers:
 
     def close(self) -> None:
         self._drivers.close()
-        self._live = {}
+        self._keep()
 
     def _keep(self) -> None:
         readers = self._drivers.readers
-        if [live.reader for live in self._live.values()] != list(readers.values()):
-            kept = {id(live.reader): live for live in self._live.values()}
-            self._live = {name: kept.get(id(reader)) or LiveDriver(reader) for name, reader in readers.items()}
+        if [live.reader for live in self._all] != list(readers.values()):
+            kept = {id(live.reader): live for live in self._all}
+            self._all = [kept.get(id(reader)) or LiveDriver(reader) for reader in readers.values()]
 
 
 class LiveBridges(Drivers[BridgeReader]):
@@ -223,18 +224,20 @@ class TouchedPlace(NamedTuple):
     module: str
 
 
+def are_on(frame: ContactsSample, structure: Structure) -> bool:
+    """Return whether contacts are on sensors of the structure."""
+    try:
+        sensors = structure.span(frame.source.type_name)
+    except StructureError:
+        return False
+    return np.array_equal(structure.sensor_uid[sensors], frame.source.uid)
+
+
 def places_of(frame: ContactsSample | None, structure: Structure) -> list[TouchedPlace]:
     """Return the places of contacts, the oldest first; none if they are of other sensors than the structure's."""
-    if frame is None:
+    if frame is None or not are_on(frame, structure):
         return []
-    source = frame.source
-    try:
-        sensors, together = structure.index(source.type_name), structure.span(source.type_name)
-    except StructureError:
-        return []
-    if not np.array_equal(structure.sensor_uid[together], source.uid):
-        return []
-    found = []
+    sensors, found = structure.index(frame.source.type_name), []
     for contact in frame:
         own = sensors[contact.taxels]
         nearest = 0
@@ -243,7 +246,7 @@ def places_of(frame: ContactsSample | None, structure: Structure) -> list[Touche
             nearest = int(np.fmin(away_m2, np.inf).argmin())
         sensor = int(own[nearest])
         module = structure.module_names[structure.sensor_module[sensor]]
-        found.append(TouchedPlace(contact, source.unit, sensor, module))
+        found.append(TouchedPlace(contact, frame.source.unit, sensor, module))
     return found
 
 

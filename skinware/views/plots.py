@@ -160,6 +160,8 @@ class Plots:
                 self._feeds.pop(source).reader.close()
 
     def blocks(self) -> list[PlotBlock]:
+        if not self.has_news:
+            return []
         waiting, self.has_news = list(self._waiting), False
         self._waiting.clear()
         return waiting + [block for feed in self._feeds.values() if len((block := feed.block()).time_ns)]

@@ -281,7 +281,7 @@ class Newest:
             return levels_of(self.physical(quantity), status, low, high)
         by_raw = _levels_by_raw(raw.dtype, quantity.type.scale, quantity.type.offset, low, high)
         levels: Levels = by_raw.take(raw)
-        if status.any():
+        if not self.is_good:
             levels[(status & np.uint8(WITHOUT_VALUE)) != 0] = NO_VALUE
         return levels
 
@@ -295,6 +295,10 @@ class Newest:
         if calm is None:
             return None
         return self.once(("calm", quantity.name), lambda: calm.physical(quantity.type.name))
+
+    @cached_property
+    def is_good(self) -> bool:
+        return not self.status.any()
 
     @property
     def contacts_position(self) -> tuple[int, int] | None:
@@ -313,8 +317,8 @@ class Newest:
     @cached_property
     def marked(self) -> npt.NDArray[np.uint8]:
         """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
-        unseen = (self.status & _NEVER_SEEN) != 0
-        return np.where(self.settling & unseen, _ALL_BITS, self.status) if unseen.any() else self.status
+        is_unseen = (self.status & _NEVER_SEEN) != 0
+        return self.status if self.is_good else np.where(self.settling & is_unseen, _ALL_BITS, self.status)
 
     @property
     def all(self) -> Sequence[DriverSnapshot]:

@@ -97,14 +97,12 @@ class Placed:
     Attributes:
         position: (n, 3) float32, m.
         normal: (n, 3) float32, outwards, of length 1; NaN where it is not known.
-        radius: (n,) float32, m; NaN where it is not known.
         is_known: whether the places of most of them are known; the others are laid out flat.
         spacing_m: usual distance from a taxel to the nearest other.
     """
 
     position: Places
     normal: Places
-    radius: Places
     is_known: bool
     spacing_m: float
 
@@ -208,7 +206,6 @@ class Scene:
             self._placed[driver, quantity.name] = Placed(
                 position.astype(np.float32),
                 normal.astype(np.float32),
-                geometry.radius_m.astype(np.float32),
                 bool(2 * geometry.known.sum() > len(quantity)),
                 FLAT_PITCH_M if np.isnan(quantity.pitch_m) else quantity.pitch_m,
             )

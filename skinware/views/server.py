@@ -37,6 +37,8 @@ _TICK_S = 0.01
 _LONGEST_S = 0.2
 """Between two looks while no viewer waits: the next one looks by itself when it asks."""
 _LONGEST_TURN_S = 0.5
+_PLOTS_EVERY_S = 0.09
+"""Between two draws of its plots by the page: samples for them are taken as rarely, unless their ring is too short."""
 _EARLY_S = 0.005
 """A turn may be sent this much earlier than the pace asks for."""
 _MOST_VIEWERS = 32
@@ -81,7 +83,7 @@ class ViewServer:
     ) -> None:
         self._follower, self._access, self._recording, self._page = follower, access, recording, page
         self._live, self._files = Show(follower), files or RecordingFiles()
-        self._doctor = doctor or DoctorProgram((), follower.namespace.name)
+        self._doctor = doctor or DoctorProgram((), follower.origins[0].namespace.name)
         self._viewers: dict[Viewer, ServerConnection] = {}
         self._marks: deque[dict[str, Any]] = deque(maxlen=_MOST_MARKS)
         self._frames, self._tls = _NOTEBOOKS if is_framed else "'none'", tls
@@ -147,12 +149,15 @@ class ViewServer:
 
     def _take(self, show: Show) -> None:
         viewers = [viewer for viewer in self._viewers if viewer.show is show]
-        period_s = 1 / max(viewer.look.fps for viewer in viewers)
-        newer = show.follower.take(round(period_s * NS_PER_S))
+        newer = show.follower.take(round(NS_PER_S / max(viewer.look.fps for viewer in viewers)))
+        is_plotting = time.monotonic() >= show.plots_due_s
+        if is_plotting:
+            show.plots_due_s = time.monotonic() + min(_PLOTS_EVERY_S, show.follower.slack_s / 4)
         for viewer in viewers:
             for driver in newer:
                 viewer.look.follow(driver)
-            viewer.plots.take()
+            if is_plotting:
+                viewer.plots.take()
         show.follow()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:

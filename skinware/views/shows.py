@@ -215,6 +215,7 @@ class Show:
         self, follower: Follower, played: Sequence[PlayedRecording] = (), problems: Sequence[str] = ()
     ) -> None:
         self.follower, self.played = follower, played
+        self.plots_due_s = 0.0  # when samples for plots are to be taken again, CLOCK_MONOTONIC
         self._problems = problems
         self._control = ReplayControl()
 

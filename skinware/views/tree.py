@@ -133,11 +133,12 @@ def problems_of(driver: ShownDriver, report: DriverReport) -> list[dict[str, Any
 
 def _marked(newest: Newest) -> Iterator[tuple[npt.NDArray[np.intp], str, str]]:
     """Yield the (k,) sensors of each problem that sensors have, its severity, and what they are or do."""
-    for bit, (severity, text) in _STATUSES.items():
+    for bit, (severity, text) in {} if newest.is_good else _STATUSES.items():
         marked = (newest.status & np.uint8(bit)) != 0
         yield np.flatnonzero(marked & ~newest.settling if bit == Status.NEVER_SEEN else marked), severity, text
+    whys = newest.why
     for why, (severity, text) in _REASONS.items():
-        yield np.flatnonzero(newest.why == why), severity, text
+        yield np.flatnonzero(whys == why), severity, text
 
 
 def problem_of_all(text: str) -> dict[str, Any]:

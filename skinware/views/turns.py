@@ -7,6 +7,7 @@ bytes from the first one.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from typing import Any
 
@@ -16,10 +17,11 @@ import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.tactile.contacts_service import ContactsSample
+from skinware.tactile.tracking import ContactKind
 from skinware.text import why_text
 from skinware.views import looks
 from skinware.views.following import ShownDriver
-from skinware.views.live import places_of
+from skinware.views.live import are_on
 from skinware.views.plots import Plots
 from skinware.views.quantities import Newest, Quantity
 from skinware.views.recorded_plots import RecordedPlots
@@ -30,7 +32,7 @@ from skinware.views.tree import problem_of_all, problems_of, state_of, worst_fir
 PROTOCOL = "skinware.view.2"
 _ALIGNMENT = 8
 _STATE_EVERY_NS = NS_PER_S
-_EXACT_EVERY_NS = NS_PER_S // 5
+_EXACT_EVERY_NS = NS_PER_S // 4
 """People read no more numbers."""
 _MOST_QUESTIONS = 64
 
@@ -208,6 +210,7 @@ class Viewer:
         if picture is None or newest is None:
             return None
         quantity, frame = picture.quantity, newest.frame
+        unit = "" if newest.motion is None else newest.motion.source.unit
         shown: dict[str, Any] = {
             "driver": driver.number,
             "type": quantity.name,
@@ -217,16 +220,9 @@ class Viewer:
             "levels": blobs.add(picture.levels, "u1"),
             "contacts": self._contacts(driver, quantity, newest),
             "regions": [
-                {
-                    "name": region.name,
-                    "value": region.load,
-                    "unit": newest.motion.source.unit,
-                    "touched": region.contacts > 0,
-                }
-                for region in newest.motion
-            ]
-            if newest.motion is not None
-            else [],
+                {"name": region.name, "value": region.load, "unit": unit, "touched": region.contacts > 0}
+                for region in newest.motion or ()
+            ],
         }
         if picture.shear is not None:
             shown |= {"shear": blobs.add(picture.shear, "i1"), "longest_shear": picture.longest_shear}
@@ -247,28 +243,26 @@ class Viewer:
         return got.contacts[1]
 
     def _touched(self, driver: ShownDriver, quantity: Quantity, frame: ContactsSample | None) -> list[dict[str, Any]]:
-        if frame is None or frame.source.type_name != quantity.type.name:
+        if (
+            frame is None
+            or frame.source.type_name != quantity.type.name
+            or not len(found := frame.contacts)
+            or not are_on(frame, driver.structure)
+        ):
             return []
-        laid_out = self.show.follower.scene.of(driver.name, quantity.name).position
-        contacts = []
-        for contact, unit, sensor, _ in places_of(frame, driver.structure):
-            pose = self.show.follower.scene.pose(driver.name, contact.frame)
-            position, normal = pose[:3, :3] @ contact.cop_m + pose[:3, 3], pose[:3, :3] @ contact.normal
-            if not np.isfinite(position).all():  # without places: in the middle of its taxels as they are laid out
-                position = laid_out[contact.taxels].mean(axis=0, dtype=np.float64)
+        scene, contacts = self.show.follower.scene, []
+        for row in range(len(found)):
+            frame_number = int(found.frame[row])
+            pose = scene.pose(driver.name, found.frames[frame_number] if frame_number >= 0 else "")
+            place = pose @ [*found.cop_m[row].tolist(), 1.0]
+            position, normal = place[:3].tolist(), (pose[:3, :3] @ found.normal[row]).tolist()
+            if not all(map(math.isfinite, position)):  # in the middle of its taxels as they are laid out
+                laid_out = scene.of(driver.name, quantity.name).position
+                position = laid_out[found.contact_of == row].mean(axis=0, dtype=np.float64).tolist()
+            kind, speed = ContactKind(found.kind[row]).name.lower(), math.hypot(*found.velocity_m_s[row].tolist())
             contacts.append(
-                {
-                    "id": contact.id,
-                    "sensor": sensor,
-                    "kind": contact.kind.name.lower(),
-                    "position": position.tolist(),
-                    "normal": normal.tolist(),
-                    "load": contact.load,
-                    "unit": unit,
-                    "area_m2": contact.area_m2,
-                    "speed": float(np.linalg.norm(contact.velocity_m_s)),
-                    "age_s": contact.age_s,
-                }
+                {name: getattr(found, name)[row].item() for name in ("id", "load", "area_m2", "age_s")}
+                | {"kind": kind, "position": position, "normal": normal, "unit": frame.source.unit, "speed": speed}
             )
         return contacts
 
@@ -335,14 +329,11 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
                 "module": blobs.add(pads.of_sensor[index], "<u2"),
                 "position": blobs.add(placed.position, "<f4"),
                 "normal": blobs.add(placed.normal, "<f4"),
-                "radius": blobs.add(placed.radius, "<f4"),
                 "placed": placed.is_known,
                 "neighbour_spacing_m": placed.spacing_m,
             }
-            | ({"axes": ["x", "y", "z"]} if quantity.axes else {})
         )
     patches = structure.module_patch[pads.module].tolist()
-    kinds = [kind.decode() for kind in structure.module_kind[pads.module].tolist()]
     return {
         "id": driver.number,
         "name": driver.name,
@@ -355,9 +346,6 @@ def _driver(driver: ShownDriver, scene: Scene, blobs: Blobs) -> dict[str, Any]:
             {"name": name, "bus": bus}
             for name, bus in zip(structure.patch_names, structure.patch_bus.tolist(), strict=True)
         ],
-        "modules": [
-            {"name": name, "patch": patch, "kind": kind}
-            for name, patch, kind in zip(pads.names, patches, kinds, strict=True)
-        ],
+        "modules": [{"name": name, "patch": patch} for name, patch in zip(pads.names, patches, strict=True)],
         "bodies": [blobs.add(outline, "<f4") for outline in scene.outlines(driver.name)],
     }

@@ -115,12 +115,9 @@ class FakeDriver:
             "module": (np.arange(self.n) // 10).astype(np.uint16),
             "position": self.position,
             "normal": self.normal,
-            "radius": np.full(self.n, 0.002, np.float32),
             "placed": self.placed,
             "neighbour_spacing_m": 0.0065,
         }
-        if self.shear is not None:
-            kind["axes"] = ["x", "y", "z"]
         return {
             "id": self.number,
             "name": self.name,
@@ -131,8 +128,7 @@ class FakeDriver:
             "buses": ["can0"],
             "patches": [{"name": f"board {8 + i}", "bus": 0} for i in range(self.boards)],
             "modules": [
-                {"name": f"triangle {i % self.triangles}", "patch": i // self.triangles, "kind": "triangle"}
-                for i in range(modules)
+                {"name": f"triangle {i % self.triangles}", "patch": i // self.triangles} for i in range(modules)
             ],
         }
 
@@ -141,9 +137,7 @@ class FakeDriver:
             "driver": self.number,
             "type": self.type,
             "generation": self.generation,
-            "acquired_ns": str(MONOTONIC_NS + time.monotonic_ns()),
             "scale": list(self.scale),
-            "unit": self.unit,
             "levels": self.levels,
             "contacts": self.contacts,
             "regions": self.regions,
@@ -183,16 +177,7 @@ class FakeDriver:
             "sensors": self.n,
             "dropped": 0,
             "load": 0.31,
-            "buses": [
-                {
-                    "name": "can0",
-                    "state": "live" if alive else "was live",
-                    "bad": GOOD if alive else OLD,
-                    "reason": "",
-                    "load": 0.31,
-                    "dropped": 0,
-                }
-            ],
+            "buses": [{"state": "live" if alive else "was live", "bad": GOOD if alive else OLD, "load": 0.31}],
             "patches": patches,
         }
 
@@ -209,9 +194,8 @@ class FakeServer:
         before_turn: called before each turn is made, for tests that move things.
     """
 
-    def __init__(self, drivers: list[FakeDriver], *, port: int = 0, fps: float = 30) -> None:
+    def __init__(self, drivers: list[FakeDriver], *, port: int = 0) -> None:
         self.drivers = drivers
-        self.fps = fps
         self.ops: list[Header] = []
         self.extra: Header = {}
         self.before_turn: Callable[[], None] = lambda: None
@@ -264,7 +248,7 @@ class FakeServer:
                     self.ops.append(op)
                     answers.update(self._answer(op))
                     continue
-                time.sleep(max(0.0, last + 1 / self.fps - time.monotonic()))
+                time.sleep(max(0.0, last + 1 / 30 - time.monotonic()))
                 last = time.monotonic()
                 if self.muted:
                     continue

@@ -58,10 +58,10 @@ HAND = """(() => {
     const driver = { name: "hand", patches: [{ name: "right hand" }] };
     driver.modules = names.map((name) => ({ name: `right hand, ${name}`, patch: 0 }));
     const places = at.flatMap(([x, y]) => [[x, y, 0], [x + 1, y + 1, 0]]).flat();
-    const sheet = { driver, n: 10, unit: "N", position: places, radius: Array(10).fill(0.1), shown: {} };
+    const sheet = { driver, n: 10, unit: "N", position: places, radius: Array(10).fill(0.1) };
     Object.assign(sheet, { normal: Array(10).fill([0, 0, 1]).flat(), patch: Array(10).fill(0) });
     sheet.module = Array.from({ length: 10 }, (_, i) => i >> 1);
-    sheet.shown.totals = a[1];
+    sheet.shown = { totals: a[1], scale: [0, 1] };
     const stage = { pixels: 100, width: 2000, camera: { position: { toArray: () => [2, 3, a[2]] } } };
     stage.project = (x, y, z) => [a[0] * 100 * x + (a[3] ?? 500), 1500 - a[0] * 100 * y, 1 / a[0]];
     const found = new m.Names();
@@ -100,21 +100,13 @@ TURN = """(() => {
     bytes[a[1] + 2] = 7;
     const { header, blob } = m.decode(bytes.buffer);
     const numbers = (where, Kind) => [...blob(where, Kind)];
-    return [header.turn, numbers([0, 3], Uint8Array), numbers([8, 4], Float32Array), numbers([2, 4], Uint32Array)];
+    return [header.turn, numbers([0, 3], Uint8Array), numbers([8, 4], Float32Array)];
 })()"""
 
 
 def test_a_turn_is_taken_apart(tell: Callable[..., Any]) -> None:
-    """Also a blob at an odd place, which no typed array can look at in its place."""
     for size in (24, 32):
-        assert tell("turn.js", TURN, '{"turn": 3}', size) == [3, [0, 0, 7], [2.5], [7]]
-
-
-@pytest.mark.parametrize("size", [0, 3, 4, 20])
-def test_a_cut_turn_is_an_error(tell: Callable[..., Any], size: int) -> None:
-    cut = f"(() => {{ const b = new Uint8Array({size}); if (b.length) b[0] = 200; m.decode(b.buffer) }})()"
-    with pytest.raises(Exception, match="RangeError"):
-        tell("turn.js", cut)
+        assert tell("turn.js", TURN, '{"turn": 3}', size) == [3, [0, 0, 7], [2.5]]
 
 
 # -- marks.js ------------------------------------------------------------------------------------------------------

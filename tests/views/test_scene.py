@@ -112,14 +112,12 @@ def test_places_are_those_of_the_geometry_and_the_rest_is_beside() -> None:
     structure = fake_structure(1, 2)
     geometry = Geometry.unknown(["pressure"] * 20, structure.sensor_uid[structure.index("pressure")])
     geometry.position_m[:], geometry.normal[:], geometry.frame[:] = triangles(2, 10), (0, 1, 0), "arm"
-    geometry.radius_m[:] = 0.002
     geometry.position_m[15:] = np.nan
     structure = structure.placed(geometry)
     placed = scene_of(a=structure).of("a", "pressure")
     assert placed.is_known
     assert np.allclose(placed.position[:15], geometry.position_m[:15])
     assert np.array_equal(placed.normal[:15], [[0, 1, 0]] * 15)
-    assert placed.radius[0] == pytest.approx(0.002)
     assert np.isfinite(placed.position).all()
     assert placed.position[15:, 0].min() > placed.position[:15, 0].max()
     assert not scene_of(a=structure).of("a", "temperature").is_known

@@ -61,7 +61,7 @@ class Card {
     setText(this.cells.raw, figure(past ? null : shown?.raw));
     setText(this.cells.age, age(past ? null : shown?.age_ms));
     setText(this.cells.noise, past ? figure(null) : measure(shown?.noise, sheet.unit));
-    setText(this.cells.uid, sheet.uid ? `0x${sheet.uid[i].toString(16)}` : figure(null));
+    setText(this.cells.uid, `0x${sheet.uid[i].toString(16)}`);
     setText(this.cells.driver, `${sheet.driver.name}, sensor ${probe.position}`);
     this.#draw();
   }

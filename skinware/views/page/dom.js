@@ -16,6 +16,8 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
+export const button = (text, title, onclick, more = {}) => h("button", { type: "button", title, onclick, ...more }, text);
+
 export const byId = (id) => document.getElementById(id);
 
 export function setText(element, text) {

@@ -13,7 +13,7 @@ export class Link {
 
   /**
    * @param {string} url of the web socket.
-   * @param {object} handlers `turn(message)`, `error(text)`, `open()`, `lost(reason, wait_ms)`.
+   * @param {object} handlers `turn(message)`, `open()`, `lost(reason, wait_ms)`.
    */
   constructor(url, handlers) {
     this.url = url;
@@ -37,8 +37,7 @@ export class Link {
     socket.onmessage = ({ data }) => {
       if (socket !== this.#socket) return;
       clearTimeout(this.#silence);
-      if (typeof data === "string") this.handlers.error(JSON.parse(data).error);
-      else this.handlers.turn(data);
+      this.handlers.turn(data);
     };
     socket.onclose = ({ reason }) => socket === this.#socket && this.#lost(reason);
     this.#listen(socket); // an answer to the connection itself may never come

@@ -74,7 +74,7 @@ const stage = new Stage(byId("stage"), {
       theme: view.theme,
       normals: view.normals,
       names: view.names ? names.place(its) : [],
-      contacts: contacts().filter(({ at }) => at),
+      contacts: contacts(),
       hovered: probes.hovered,
       pins: probes.pins.filter(({ sheet }) => its.sheets.includes(sheet)),
     }),
@@ -87,7 +87,6 @@ const overlay = new Overlay(byId("stage"));
 const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/live${location.search}`, {
   open: connected,
   lost: disconnected,
-  error: (text) => notify(text),
   turn,
 });
 const send = (op) => link.send(op);

@@ -23,7 +23,7 @@ class Probe {
 }
 
 function keyOf(sheet, i) {
-  return `${sheet.driver.key}:${sheet.type}:${sheet.uid ? sheet.uid[i].toString(16) : sheet.index[i]}`;
+  return `${sheet.driver.key}:${sheet.type}:${sheet.uid[i].toString(16)}`;
 }
 
 /** The taxel of a key: {sheet, i}; null if there is no such one now. */
@@ -31,7 +31,7 @@ export function resolve(skin, key) {
   const [driver, type, id] = key.split(":");
   const sheet = skin.sheets(type).find((one) => one.driver.key === driver);
   if (!sheet || !/^[0-9a-f]+$/.test(id ?? "")) return null;
-  const i = sheet.uid ? sheet.uid.indexOf(BigInt(`0x${id}`)) : sheet.index.indexOf(Number(id));
+  const i = sheet.uid.indexOf(BigInt(`0x${id}`));
   return i < 0 ? null : { sheet, i };
 }
 

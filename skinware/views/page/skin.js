@@ -14,13 +14,12 @@ class Sheet {
   constructor(driver, table, blob) {
     this.driver = driver;
     this.type = table.name;
-    this.unit = table.unit ?? "";
+    this.unit = table.unit;
     this.n = table.n;
-    this.hasShear = Boolean(table.axes);
-    this.isTouch = table.touch ?? true;
-    this.total = table.total ?? null; // of several taxels: "sum" or "highest"
+    this.isTouch = table.touch;
+    this.total = table.total; // of several taxels: "sum" or "highest"
     this.index = blob(table.index, Uint32Array); // positions in a frame
-    this.uid = table.uid ? blob(table.uid, BigUint64Array) : null;
+    this.uid = blob(table.uid, BigUint64Array);
     this.patch = blob(table.patch, Uint16Array);
     this.module = blob(table.module, Uint16Array);
     this.arrange(table, blob);
@@ -45,10 +44,8 @@ class Sheet {
     this.placed = table.placed;
     this.scenePosition = blob(table.position, Float32Array);
     this.moved();
-    this.normal = withZeros(table.normal ? blob(table.normal, Float32Array) : new Float32Array(3 * this.n));
-    const spacing = table.neighbour_spacing_m || smallestStep(this.position);
-    const given = table.radius ? blob(table.radius, Float32Array) : new Float32Array(this.n).fill(NaN);
-    this.radius = given.map((r) => (spacing > 0 ? DRAWN_PART * spacing : r > 0 ? r : 0.002));
+    this.normal = blob(table.normal, Float32Array).map((x) => (Number.isNaN(x) ? 0 : x));
+    this.radius = new Float32Array(this.n).fill(DRAWN_PART * table.neighbour_spacing_m);
   }
 
   /** Its driver was moved. */
@@ -64,9 +61,10 @@ class Sheet {
     this.shear = picture.shear ? blob(picture.shear, Int8Array) : null;
     this.totals = picture.totals ? blob(picture.totals, Float32Array) : null;
     this.between = picture.between ? blob(picture.between, Float32Array) : null;
-    this.contacts = (picture.contacts ?? []).map((contact) => ({ ...contact, at: this.#placeOf(contact) }));
-    this.regions = picture.regions ?? [];
-    this.scale = picture.scale ?? this.scale;
+    const { shift } = this.driver;
+    this.contacts = picture.contacts.map((contact) => ({ ...contact, at: contact.position.map((x, c) => x + shift[c]) }));
+    this.regions = picture.regions;
+    this.scale = picture.scale;
     this.mode = mode;
   }
 
@@ -74,13 +72,6 @@ class Sheet {
   show(picture = this) {
     for (const part of PARTS) this.shown[part] = picture[part];
     this.fill();
-  }
-
-  /** Where a contact is, or else its taxel; null if neither is known. */
-  #placeOf({ position, sensor }) {
-    if (position?.every(Number.isFinite)) return position.map((x, c) => x + this.driver.shift[c]);
-    const i = this.index.indexOf(sensor);
-    return i < 0 ? null : [...this.place(i)];
   }
 
   fill() {
@@ -111,9 +102,9 @@ class Driver {
     this.type = table.type;
     this.key = keyOf(table);
     this.generation = table.generation;
-    this.buses = table.buses ?? [];
-    this.patches = table.patches ?? [];
-    this.modules = table.modules ?? [];
+    this.buses = table.buses;
+    this.patches = table.patches;
+    this.modules = table.modules;
     this.state = "live";
     this.isCut = false; // the connection to the server is lost
     this.arrange(table, blob);
@@ -233,17 +224,3 @@ export class Skin {
 export const outlinesOf = (sheets) => [...new Set(sheets.map(({ driver }) => driver))].flatMap(({ outlines }) => outlines);
 
 const keyOf = ({ namespace, name }) => `${namespace}/${name}`;
-
-function withZeros(normals) {
-  return normals.map((x) => (Number.isNaN(x) ? 0 : x));
-}
-
-/** The distance between the first taxel and its nearest neighbour, m; 0 if there is one alone. */
-function smallestStep(position) {
-  let best = Infinity;
-  for (let i = 3; i < position.length; i += 3) {
-    const d = Math.hypot(...[0, 1, 2].map((c) => position[i + c] - position[c]));
-    if (d > 0 && d < best) best = d;
-  }
-  return best === Infinity ? 0 : best;
-}

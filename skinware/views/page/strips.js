@@ -1,6 +1,6 @@
 // The strips: lines are dragged or clicked into them; they share one window of time and one cursor.
 
-import { h, save, setChildren, setHidden, setPressed, setText, stamp } from "./dom.js";
+import { button, h, save, setChildren, setHidden, setPressed, setText, stamp } from "./dom.js";
 import { figure, measure } from "./format.js";
 import { CanvasPen, saveFigure } from "./pens.js";
 import { KEPT_S, placeOf } from "./series.js";
@@ -24,10 +24,9 @@ class Strip {
     this.cursor_hz = null;
     this.legend = h("ul", { class: "lines" });
     this.canvas = h("canvas", { tabindex: 0, role: "slider", "aria-valuemin": -KEPT_S, "aria-valuemax": 0, "data-role": "strip-canvas" });
-    const button = (text, title, onclick) => h("button", { type: "button", title, onclick }, text);
     this.spectrum = button("Spectrum", "How much of a line swings at each frequency", () => this.toggle());
     const files = ["csv", "svg", "png"].map((kind) => button(kind.toUpperCase(), `Save as ${kind.toUpperCase()}`, () => this.save(kind)));
-    const close = h("button", { type: "button", class: "plain", "aria-label": "Close this strip", onclick: () => strips.close(this) }, "✕");
+    const close = button("✕", "Close this strip", () => strips.close(this), { class: "plain", "aria-label": "Close this strip" });
     const tools = h("div", { class: "tools" }, this.spectrum, ...files, close);
     this.element = h("article", { class: "strip", "data-role": "strip" }, h("header", {}, this.legend, tools), this.canvas);
     this.#listen();
@@ -230,9 +229,9 @@ export class Strips {
    */
   constructor(host, lines, parts) {
     Object.assign(this, { host, lines, parts, theme: "dark", cursor_ns: null });
-    const button = (text, label, onclick) => h("button", { type: "button", "aria-label": label, title: label, onclick }, text);
     this.span = h("output");
-    const zoom = h("div", { class: "group" }, button("−", "More seconds", () => this.zoom(ZOOM)), button("+", "Fewer seconds", () => this.zoom(1 / ZOOM)));
+    const step = (text, label, times) => button(text, label, () => this.zoom(times), { "aria-label": label });
+    const zoom = h("div", { class: "group" }, step("−", "More seconds", ZOOM), step("+", "Fewer seconds", 1 / ZOOM));
     this.head = h("header", {}, h("h2", {}, "Plots"), this.span, zoom);
     this.hint = h("p", { class: "hint drop" }, "Drop it here for a strip of its own.");
     this.list = h("div", { class: "strips" });

@@ -1,6 +1,6 @@
 // Time: pause, 30 s to scroll back, and the controls of recordings.
 
-import { h, setChildren, setHidden, setPressed, setText } from "./dom.js";
+import { button, h, setChildren, setHidden, setPressed, setText } from "./dom.js";
 import { clock } from "./format.js";
 import { Timeline } from "./timeline.js";
 
@@ -72,7 +72,6 @@ export class ReplayControls {
     this.host = host;
     this.act = act;
     this.replays = [];
-    const button = (text, title, onclick) => h("button", { type: "button", title, onclick }, text);
     this.play = button("Pause", "Stop or go on (space)", () => this.toggle());
     this.back = button("Back", "One sample back (,)", () => this.step(-1));
     this.on = button("Step", "One sample on (.)", () => this.step(1));

@@ -1,6 +1,6 @@
 // The wipe test: a hand goes over what is selected; what does not answer is listed.
 
-import { h, save, setHidden, setText, stamp } from "./dom.js";
+import { button, h, save, setHidden, setText, stamp } from "./dom.js";
 import { count } from "./format.js";
 import { DIMMED, MASKED } from "./marks.js";
 import { TOP } from "./palette.js";
@@ -44,7 +44,6 @@ export class Wipe {
     this.progress = null;
     this.text = h("strong", { role: "status" });
     this.meter = h("progress", { "aria-label": "Taxels touched" });
-    const button = (text, title, onclick) => h("button", { type: "button", title, onclick }, text);
     this.run = button("Stop", "Start or end the test (w)", () => this.toggle());
     this.list = button("Save the list", "Of those that were not touched (l)", () => this.save());
     host.append(this.text, this.meter, h("div", { class: "group" }, this.run, this.list));

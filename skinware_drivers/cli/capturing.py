@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 
 def driver_of_recording(bus_names: Sequence[str]) -> str:
-    found = (recorded.driver_type for recorded in map(_recorded, bus_names) if recorded is not None)
-    return next(filter(None, found), "")
+    return next((it.driver_type for it in map(_recorded, bus_names) if it is not None and it.driver_type), "")
 
 
 def only_listened(bus_names: Sequence[str]) -> bool:
@@ -117,10 +116,10 @@ def _record(path: Path, driver: str, namespace: str) -> None:
             size, missed = target.size, recorder.missed
     except FileExistsError:
         problem = "exists already: give another name, or remove it"
-    except OSError as error:
-        problem = error.strerror or str(error)
-    except SkinwareError as error:
-        problem = str(error)
+    except (OSError, SkinwareError) as error:
+        problem = getattr(error, "strerror", None) or str(error)
+        if size:  # the driver may go on for hours
+            print(f"{path}: ended early: {problem}; the driver goes on", file=sys.stderr)  # noqa: T201
     _say(problem=problem, bytes=size, missed=missed)
 
 

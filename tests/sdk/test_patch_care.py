@@ -68,14 +68,10 @@ class Stage:
         self.forgotten: list[int] = []
         self.tasks: list[asyncio.Task[None]] = []
         nothing: Callable[..., None] = lambda *_: None  # noqa: E731
+        pace, patches = SimpleNamespace(silence_ns=0), SimpleNamespace(counts_from_ns=[0] * len(PATCHES))
         generation = SimpleNamespace(
             begun_ns=0,
-            publisher=SimpleNamespace(
-                pace=SimpleNamespace(silence_ns=0),
-                lose=nothing,
-                silent_ns=lambda _patch: 1 << 62,
-                patches=SimpleNamespace(counts_from_ns=[0] * len(PATCHES)),
-            ),
+            publisher=SimpleNamespace(pace=pace, lose=nothing, silent_ns=lambda _patch: 1 << 62, patches=patches),
             decoder=SimpleNamespace(forget=self.forgotten.append),
             watch=SimpleNamespace(forget=nothing),
             patches_in=lambda _line, *states: [patch for patch in PATCHES if self.states[patch.key] in states],

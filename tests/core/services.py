@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from skinware import DriverWriter, ServiceWriter
+from skinware import DriverWriter, Namespace, ServiceWriter
 from skinware.memory.locks import Descriptor
+from skinware.service import Writer
+from skinware.service._server import short_path
 
 SMALL = {"values": ("<u8", 512)}
 
@@ -19,6 +22,20 @@ def publish(writer: ServiceWriter | DriverWriter, value: int) -> None:
     """A frame whose every value is this."""
     writer.begin()["values"][:] = value
     writer.commit(time.monotonic_ns())
+
+
+def kill(writer: Writer) -> None:
+    """What the kernel does with a killed writer: its locks go, its files stay."""
+    writer._ring.segment.descriptor.close()
+    writer._name_lock.close()
+
+
+def connect() -> socket.socket:
+    peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with short_path(Namespace().socket_path("x")) as path:
+        peer.connect(path)
+    peer.setblocking(False)
+    return peer
 
 
 @contextmanager

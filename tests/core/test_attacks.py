@@ -21,8 +21,8 @@ from skinware import Namespace, Sample, ServiceReader
 from skinware.memory import file_layout
 from skinware.memory.announcement import _SIZE, living_readers, sweep
 from skinware.memory.locks import _FLOCK
-from skinware.service._server import short_path
 from skinware_drivers.testing.waiting import wait_until
+from tests.core.services import connect
 from tests.core.users import (
     ANSWERS,
     CONTROL,
@@ -112,14 +112,6 @@ BAD_PACKETS = [
     b'{"id":null,"operation":"echo"}',
     ASK[:-5],
 ]
-
-
-def connect() -> socket.socket:
-    peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with short_path(Namespace().socket_path("x")) as path:
-        peer.connect(path)
-    peer.setblocking(False)
-    return peer
 
 
 def garbage(board: Path, seed: int) -> int:

@@ -19,6 +19,7 @@ from skinware.errors import Closed, ServiceTimeout
 from skinware.memory.ring_reader import Take
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import fake_structure
+from tests.core.services import kill
 
 STRUCTURES = [fake_structure(1, 1), fake_structure(1, 2), fake_structure(2, 2)]
 NAMES = "abc"
@@ -48,12 +49,6 @@ def publish(writer: DriverWriter, value: int) -> None:
     columns["values"][:] = value % 251
     columns["status"][:] = value % 3
     writer.commit(value)
-
-
-def kill(writer: DriverWriter) -> None:
-    """Its locks go, and nothing else changes."""
-    writer._ring.segment.descriptor.close()
-    writer._name_lock.close()
 
 
 def clear_away(name: str) -> None:

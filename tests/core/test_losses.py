@@ -6,18 +6,11 @@ import pytest
 
 from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import Overrun, StructureChanged
-from skinware.service import Writer
 from skinware.service._reader import Tap
-from tests.core.services import publish
+from tests.core.services import kill, publish
 from tests.core.workers import seeded
 
 COLUMNS = {"values": ("<u8", 4)}
-
-
-def die(writer: Writer) -> None:
-    """What the kernel does with a killed writer: its locks go, its files stay."""
-    writer._ring.segment.descriptor.close()
-    writer._name_lock.close()
 
 
 def test_generations_that_came_and_went_between_two_reads_are_counted() -> None:
@@ -50,7 +43,7 @@ def test_losses_are_exact_over_any_ends_and_restarts(request: pytest.FixtureRequ
                     writer.close()
                     writer = ServiceWriter("x", COLUMNS)
                 case 1:
-                    die(writer)
+                    kill(writer)
                     writer = ServiceWriter("x", COLUMNS)
                 case 2:
                     writer.restructure(COLUMNS)

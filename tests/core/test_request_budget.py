@@ -17,9 +17,9 @@ import pytest
 from skinware import Namespace, Sample, ServiceReader, ServiceWriter
 from skinware.errors import RequestRefused
 from skinware.service import RequestServer, _server
-from skinware.service._server import MOST_TURN_NS, short_path
+from skinware.service._server import MOST_TURN_NS
 from skinware.service.messages import decode_arguments
-from tests.core.services import SMALL
+from tests.core.services import SMALL, connect
 
 
 def echo(value: object) -> object:
@@ -37,14 +37,6 @@ def serving(peers: int = 0) -> Iterator[tuple[ServiceWriter, RequestServer, list
         while len(server._peers) < peers:
             assert server.take() == []
         yield writer, server, made
-
-
-def connect() -> socket.socket:
-    peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with short_path(Namespace().socket_path("x")) as path:
-        peer.connect(path)
-    peer.setblocking(False)
-    return peer
 
 
 def ask(peer: socket.socket, number: int, value: object = 0) -> None:

@@ -20,7 +20,8 @@ from skinware_drivers.loading import registered
 from skinware_drivers.registry import DRIVERS
 from skinware_drivers.testing.waiting import SLOWER, read_until
 from tests.commands import running
-from tests.drivers.hostile_wire import free_port, hostile_devices, processor_s, resident_bytes
+from tests.drivers.hostile_wire import hostile_devices, processor_s, resident_bytes
+from tests.streams.peers import free_port
 
 _NOT_FRESH = np.uint8(Status.STALE | Status.NEVER_SEEN)
 _PATIENCE_S = 30 * SLOWER

@@ -18,14 +18,9 @@ from skinware.recording import Recording, WireItem
 from skinware_drivers.doctor.report import Disguise, Secrets
 from skinware_drivers.testing.waiting import wait_until
 from tests.commands import refused, run, running
+from tests.streams.peers import LOCAL, free_port
 
 ARRAY = str(Path(__file__).parents[1] / "modbus" / "array_file.py")
-LOCAL = "127.0.0.1"
-
-
-def free_port() -> int:
-    with socket.create_server((LOCAL, 0)) as server:
-        return int(server.getsockname()[1])
 
 
 def frames_come(driver: Any, name: str) -> None:

@@ -158,3 +158,16 @@ def test_a_view_that_became_invalid_was_not_taken() -> None:
             publish(writer, 5)
             reader.read()  # counted before the older one's view ends
         assert (reader.statistics.frames, reader.missed) == (3, 3)
+
+
+def test_a_program_that_was_held_up_catches_up_and_one_that_is_too_slow_gets_the_newest() -> None:
+    with ServiceWriter("x", COLUMNS, slots=64) as writer, ServiceReader[Sample]("x") as reader:
+
+        def next_after(count: int) -> int:
+            for _ in range(count):
+                publish(writer, writer.sequence + 1)
+            return reader.read_next().sequence
+
+        assert [next_after(count) for count in (1, 19, *[0] * 18)] == [*range(1, 21)]
+        assert [next_after(2) for _ in range(4)] == [21, 22, 26, 28]
+        assert (reader.missed, reader.is_too_slow) == (4, True)

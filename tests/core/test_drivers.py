@@ -10,8 +10,7 @@ from skinware import DriverReader, DriverWriter, Namespace, Sample, ServiceReade
 from skinware.drivers import Drivers
 from skinware.errors import NamespaceError
 from tests.cli.fake_skin import fake_structure
-from tests.core.services import SMALL, publish
-from tests.core.test_losses import die
+from tests.core.services import SMALL, kill, publish
 
 STRUCTURE = fake_structure(1, 1)
 
@@ -43,7 +42,7 @@ def test_a_dead_service_stays_unless_only_living_ones_are_wanted(namespace: Name
         living.look()
         assert not living.readers  # it has published nothing
         publish(writer, 1)
-        die(writer)
+        kill(writer)
         services.look()
         living.look(at_once=True)
         assert services.newest("a").stale

@@ -14,8 +14,7 @@ from skinware import skin as skin_module
 from skinware.errors import BadServiceFile, PeerGone, StructureChanged
 from skinware.memory import file_layout
 from tests.cli.fake_skin import BUS_COUNTERS, fake_structure
-from tests.core.services import SMALL, publish
-from tests.core.test_losses import die
+from tests.core.services import SMALL, kill, publish
 
 STRUCTURE = fake_structure(1, 2)
 
@@ -54,7 +53,7 @@ def test_a_driver_whose_name_becomes_something_else_leaves_the_skin_until_it_is_
     with skin, driver("a"):
         first = driver("b")
         assert look(skin) == ("a", "b")
-        die(first)
+        kill(first)
         with successor("b") as other:
             publish(other, 1)
             for _ in range(5):
@@ -72,7 +71,7 @@ def test_its_reader_says_that_it_changed_and_reattach_says_what_it_is(
     first = driver("b")
     with DriverReader("b") as reader:
         frame = reader.read()
-        die(first)
+        kill(first)
         with successor("b") as other:
             publish(other, 1)
             assert reader.newest_position == frame.position
@@ -107,7 +106,7 @@ def attached(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_what_a_killed_driver_left_costs_a_skin_nothing(namespace: Namespace, attached: list[str]) -> None:
     """Neither is its structure read, nor a reader of it announced."""
     with driver("live"), Skin() as skin:
-        die(driver("dead"))
+        kill(driver("dead"))
         assert look(skin) == ("live",)
         announced = namespace.readers_path.stat().st_mtime_ns
         for _ in range(5):

@@ -23,8 +23,7 @@ from skinware.service import _reader as reader_module
 from skinware.service._reader import Tap
 from skinware.service._taking import Accounts
 from tests.cli.fake_skin import fake_structure
-from tests.core.services import SMALL, at_0, publish
-from tests.core.test_losses import die
+from tests.core.services import SMALL, at_0, kill, publish
 
 MS = 1_000_000
 
@@ -352,7 +351,7 @@ def test_the_message_of_a_timeout_says_what_the_writer_does() -> None:
         assert read(newer_than=last) == "no newer sample of 'x': its writer is paused"
         writer.resume()
         assert not reader.paused
-        die(writer)
+        kill(writer)
         assert read(newer_than=last) == "no newer sample of 'x': its writer is dead or was stopped; start it again"
     ServiceWriter("x", SMALL).close()  # clears the dead one away
 
@@ -401,7 +400,7 @@ def test_a_sample_of_a_later_generation_is_found_at_once_though_the_earlier_one_
     with ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
         reader.read()
-        die(writer)
+        kill(writer)
         with ServiceWriter("x", SMALL) as later:
             publish(later, 2)
             monkeypatch.setattr(Word, "wait", refuse_to_wait)
@@ -465,7 +464,7 @@ def test_a_dead_writer_is_asked_nothing(is_restructured: bool, what: Callable[[S
         assert reader.structure_changed == is_restructured
         with pytest.raises(RequestRefused):  # it lives, and takes no requests
             reader.ask("add", a=1)
-        die(writer)
+        kill(writer)
         if is_restructured or what is stay:
             what(writer)
         with pytest.raises(PeerGone, match="is dead"):

@@ -12,6 +12,7 @@ from skinware.conversion import Selection
 from skinware.conversion.learning import Interval, Join, LearningSet, convert_to_learning_set
 from skinware.learning.images import Colours, TouchImage, range_of
 from skinware.skin_layout import SkinLayout
+from skinware.tactile.regions import SensorChoice
 from tests.cli.fake_skin import fake_structure
 from tests.recording.made import START_NS
 from tests.recording.test_learning_set import Made, physical, status_of, table_of, write, write_images
@@ -41,7 +42,7 @@ def main() -> None:
         "camera": ([one], LearningSet(fps=25, joins=[camera], at=camera.feature)),
     }
     touch = LearningSet(fps=25, form="images", size=(48, 96), video=True)
-    convert_to_learning_set([one.path], folder / "videos", touch, Selection(types=["pressure"]))
+    convert_to_learning_set([one.path], folder / "videos", touch, Selection(sensors=SensorChoice(types=["pressure"])))
     np.save(folder / "videos.npy", touch_images(one, range(0, FRAMES, 4)))
     for name, (made, wanted) in sets.items():
         convert_to_learning_set([each.path for each in made], folder / name, wanted)

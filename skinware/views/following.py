@@ -241,7 +241,7 @@ class Follower:
         self.robot = robot or Robot()
         self.scene = Scene({}, self.robot.poses)
         self._numbers: dict[tuple[str, str], int] = {}
-        self._found: list[list[LiveDriver]] = []
+        self._found: list[list[LiveDriver]] = [[] for _ in origins]
 
     def get(self, number: int) -> ShownDriver | None:
         return next((driver for driver in self.drivers if driver.number == number), None)

@@ -274,7 +274,7 @@ class CalmService:
     def _warn(self, chain: Chain) -> None:
         """Warn once of being too slow, of sensors that wait for their baselines, and of those that a touch lowers."""
         reader = self._source.reader
-        if self._is_new(("", "slow"), reader is not None and reader.is_too_slow):
+        if reader is not None and reader.is_too_slow and self._is_new(("", "slow"), True):
             log.warning(
                 "%s: samples come faster than they can be taken: only the newest are, as long as that is so", self.name
             )

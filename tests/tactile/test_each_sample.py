@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
 from collections.abc import Iterator
@@ -218,6 +219,25 @@ def test_an_onset_in_a_hold_up_is_that_of_the_second_touched_sample(calm_namespa
             event = next(contacts.events(timeout_s=30))
             assert (event.kind, event.acquired_ns) == (EventKind.ONSET, (before + 22) * PERIOD_NS)
         assert service.status()["missed"] == 0
+
+
+def test_a_service_that_is_too_slow_now_and_then_says_so_once(
+    calm_namespace: Namespace, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    hand, service = Hand(), CalmService("hand", into=calm_namespace, state_path=tmp_path / "state.npz")
+    counts = iter(3 * ([2] * 20 + [1] * 20))
+
+    def publish_faster() -> None:
+        count = next(counts, None)
+        if count is None:
+            service.stop()
+        else:
+            hand.publish(count)
+
+    with hand.writer, caplog.at_level(logging.WARNING):
+        hand.publish(1)
+        service.run(publish_faster, 0.0)
+    assert caplog.text.count("samples come faster than they can be taken") == 1
 
 
 def test_a_tool_gets_the_newest_sample_and_then_each() -> None:

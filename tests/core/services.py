@@ -25,7 +25,7 @@ def publish(writer: ServiceWriter | DriverWriter, value: int) -> None:
 
 
 def kill(writer: Writer) -> None:
-    """What the kernel does with a killed writer: its locks go, its files stay."""
+    """Leave a writer as the kernel leaves a killed one: its files stay, its locks go."""
     writer._ring.segment.descriptor.close()
     writer._name_lock.close()
 

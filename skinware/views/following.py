@@ -169,10 +169,13 @@ class ShownDriver:
         report = report_of(
             live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status
         )
-        if self.origin.recording is not None and life_of(live.reader, self.frame) == PAUSED:
+        if self._stands_still(life_of(live.reader, self.frame)):
             patches = tuple(replace(patch, rate_hz=None, age_ns=None) for patch in report.patches)
             report = replace(report, rate_hz=None, age_ns=None, patches=patches)
         return report
+
+    def _stands_still(self, life: str) -> bool:
+        return life == PAUSED and self.origin.recording is not None
 
     def take(self, frame: DriverSnapshot) -> None:
         if frame.structure is not self.structure and frame.structure != self.structure:
@@ -194,7 +197,7 @@ class ShownDriver:
         if before is None or now_ns() - self._judged_ns < _JUDGE_EVERY_NS:
             return
         before_life, life = self.life, life_of(self.live.reader, before.frame)
-        stands_still = life == PAUSED and self.origin.recording is not None
+        stands_still = self._stands_still(life)
         self.life = before_life if stands_still else life
         self.newest = self._judged(before.frame, before.status if stands_still else status_now(life, before.frame))
         if (

@@ -163,8 +163,8 @@ class Generation:
         for patch, ratio in self._doubles.look(self.decoder.state.patch_counters[:, _UPDATES]):
             log.warning(
                 "%s has sent %.1f times as much as its period allows for a while: do two devices send with one"
-                " identifier? Their values would mix. Unplug one and look, or give the driver the right period; logged"
-                " once",
+                " identifier? Their values would mix. Unplug one and look, or give the driver the right period"
+                " (period_ms, period_s); logged once",
                 self.name_of(patch),
                 ratio,
             )

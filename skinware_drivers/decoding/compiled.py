@@ -377,6 +377,5 @@ class CompiledLayouts:
         offset = conditions[0][0].offset
         table = np.full((256, self.length_ok.shape[1]), NO_KIND, np.uint8)
         for number, (frame, condition) in enumerate(zip(self.frames, conditions, strict=True)):
-            # bytes behind the end of a payload have no meaning
-            table[condition[0].value, [length for length in frame.length if length > offset]] = number
+            table[condition[0].value, list(frame.length)] = number
         return offset, table

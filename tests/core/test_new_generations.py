@@ -16,7 +16,7 @@ from skinware.memory import file_layout, ring_writer, segments
 from skinware.memory.ring_reader import RingReader
 from skinware.service import _attachment, _ownership
 from skinware_drivers.testing.waiting import wait_until
-from tests.core.services import SMALL, publish
+from tests.core.services import SMALL, kill, publish
 from tests.specification import ring as specification
 
 pytestmark = pytest.mark.usefixtures("ring")
@@ -95,6 +95,17 @@ def test_pausing_an_old_generation_does_not_hide_that_there_is_a_new_one() -> No
         writer.pause()
         writer.resume()
         assert reader._ring.state == file_layout.STATE_SUPERSEDED
+
+
+def test_readers_leave_an_unmarked_generation_of_a_killed_writer(monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = ServiceWriter("x", SMALL)
+    with ServiceReader[Sample]("x") as reader:
+        kill(writer)
+        monkeypatch.setattr(segments.Segment, "mark", lambda *_: None)  # its successor is stopped before
+        with ServiceWriter("x", SMALL) as successor:
+            publish(successor, 2)
+            with reader.view() as frame:
+                assert frame.column("values")[0] == 2
 
 
 @pytest.mark.parametrize("where", ["RingWriter", "publish"])

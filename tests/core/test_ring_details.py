@@ -108,6 +108,14 @@ def test_the_latest_time_and_all_flags_are_published_as_they_are() -> None:
             assert (sample.acquired_ns, sample.flags) == (acquired_ns, flags)
 
 
+def test_every_change_of_the_state_changes_the_wake_word() -> None:
+    with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
+        for change in (writer.pause, writer.resume, writer.close):
+            before = reader._ring.wake_count
+            change()
+            assert reader._ring.wake_count != before
+
+
 def test_a_writer_whose_descriptor_is_0_writes() -> None:
     with ServiceWriter("x", SMALL) as writer, ServiceReader[Sample]("x") as reader:
         publish(writer, 1)
@@ -274,6 +282,18 @@ def test_every_wake_of_any_ring_ends_a_wait_and_none_is_left_to_python() -> None
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)
         assert calls > 50  # a wait that no wake ends takes 50 ms
+
+
+def test_a_signal_ends_a_sleep_and_leaves_nothing_to_python() -> None:
+    before = signal.signal(signal.SIGALRM, lambda *_: None)
+    try:
+        with Two() as two:
+            for _ in range(5):
+                signal.setitimer(signal.ITIMER_REAL, 0.005)
+                assert two.next(NEWER, HOUR_NS) == []
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def sleeps() -> int:

@@ -15,7 +15,7 @@ from skinware_drivers.bus import EXTENDED_FLAG, FrameBatch, wire_dtype
 from skinware_drivers.decoding.addresses import Addresses
 from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, join_types, taxels
-from skinware_drivers.fields import Bits, Byte, Identifier, SequenceNumber
+from skinware_drivers.fields import Bits, Byte, Identifier
 from skinware_drivers.layout import MOST_FRAMES, Cycle, Frame, Layout, Values
 from tests.specification.decoding import SpecifiedDecoder, slots_of
 
@@ -179,21 +179,6 @@ def test_frames_of_three_kilobytes() -> None:
     assert decoder.state.bus_counters[0, :3].tolist() == [0, 1, 0]
 
 
-def test_sequence_numbers_that_go_back_are_no_loss() -> None:
-    layout = Layout([Frame("data", (Identifier(0x100),), (8,), Values(2, "<u2", 1), sequence=SequenceNumber(0, "<u2"))])
-    decoder = SpecifiedDecoder([layout], tables_of(patches(0, modules=(0,))))
-    sent = [10, 11, 13, 12, 12, 14, 3, 4, 6]  # 12 was overtaken, and came twice; 3 is of a device that begins again
-    run(decoder, [(0, 0x100, numbers(number, number)) for number in sent[:3]])
-    run(decoder, [(0, 0x100, numbers(number, number)) for number in sent[3:6]])
-    assert decoder.state.values[0] == 14
-    run(decoder, [(0, 0x100, numbers(number, number)) for number in sent[6:]])
-    counters = dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
-    assert decoder.state.values[0] == 6
-    assert counters["sequence_lost"] == 1  # 5
-    assert counters["sequence_back"] == 4
-    assert counters["updates"] == 6
-
-
 def test_types_of_several_buses_are_put_together() -> None:
     counts, celsius = PRESSURE.measured(unit="counts"), TEMPERATURE.measured(unit="degC")
     assert join_types([[counts], [celsius, counts]]) == [counts, celsius]
@@ -213,17 +198,6 @@ def test_identifiers_that_cannot_be_matched_are_refused() -> None:
     ]
     with pytest.raises(ConfigurationError, match="a driver takes 200: run several"):
         SpecifiedDecoder(layouts, tables_of(patches(0), patches(0)))
-
-
-def test_a_batch_of_orphans_alone_has_no_sequence_to_check() -> None:
-    frames = [
-        Frame(f"f{i}", (Identifier(0x100 + i),), (8,), Values(2, "<u2", 1, to=(i,)), sequence=SequenceNumber(0, "<u2"))
-        for i in range(2)
-    ]
-    layout = Layout(frames, Cycle(["f0", "f1"], maximum_age_s=1.0))
-    decoder = SpecifiedDecoder([layout], tables_of(patches(0, modules=(0,))))
-    run(decoder, [(0, 0x101, numbers(1)), (0, 0x101, numbers(2))])
-    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 2
 
 
 def test_a_wide_key_of_a_module_is_not_taken_for_one_of_the_next_patch() -> None:

@@ -135,24 +135,26 @@ def test_frames_wait_for_groups_of_up_to_one_and_a_half_periods(longer_ns: int, 
 
 def test_sequence_numbers_are_compared_for_each_module_whatever_comes_between() -> None:
     layout = one_frame(Values(1, "u1", 1), module=Bits(0, 4), sequence=SequenceNumber(0, "u1"))
-    modules = [Module(taxels(1, first_uid=key), key=key) for key in range(3)]
-    sent = {0: [0, 1, 2, 5], 1: [250, 251, 251, 3], 2: [7, 6, 7]}
+    modules = [Module(taxels(1, first_uid=key), key=key) for key in range(4)]
+    # of the last: 12 was overtaken, and came twice; 3 is of a device that begins again
+    sent = {0: [0, 1, 2, 5], 1: [250, 251, 251, 3], 2: [7, 6, 7], 3: [10, 11, 13, 12, 12, 14, 3, 4, 6]}
     with decoding(layout, skin(modules)) as (pair, begin_ns):
-        for at in range(4):
+        for at in range(9):
             pair.feed(
                 [
-                    (0, begin_ns + at, 0x100 | key, bytes([numbers[at], 0, 0, 0, 0, 0, 0, 0]))
+                    (0, begin_ns + at, 0x100 | key, bytes([numbers[at]] * 8))
                     for key, numbers in sent.items()
                     if at < len(numbers)
                 ]
             )
         assert counted(pair) == {
-            "updates": 10,
-            "sequence_lost": 2 + 7,
+            "updates": 10 + 6,
+            "sequence_lost": 2 + 7 + 1,
             "sequence_repeated": 2,
-            "sequence_back": 1,
+            "sequence_back": 1 + 4,
         }
-        assert pair.native.decoder.last_sequence[:, 0].tolist() == [5, 3, 7]
+        decoder = pair.native.decoder
+        assert decoder.last_sequence[:, 0].tolist() == decoder.state.values.tolist() == [5, 3, 7, 6]
 
 
 # -- cycles --------------------------------------------------------------------------------------------------------

@@ -366,20 +366,6 @@ def test_sequence_numbers_of_a_restarted_patch_are_no_loss() -> None:
     assert sum(counters.values()) == 2
 
 
-def test_sequence_numbers_tell_losses_and_repeats() -> None:
-    layout = one(Values(1, "u1", 1), sequence=SequenceNumber(0, "u1"))
-    numbers = [254, 255, 0, 3, 3]
-    frames = [(0x100, bytes((n, 9)) + bytes(6)) for n in numbers]
-    decoder = SpecifiedDecoder([layout], assemble([("bus", [Patch("p", [Module(taxels(1))])])], TYPES, "u1"))
-    batch = FrameBatch(16, 8, decoder.compiled.headroom)
-    for identifier, payload in frames:
-        decoder.put_back(batch)
-        batch.append(0, 1, identifier, payload)
-        decoder.state.show(decoder.decode(batch)[0])
-    counters = dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
-    assert (counters["sequence_lost"], counters["sequence_repeated"]) == (2, 1)
-
-
 def test_expand_is_the_escape() -> None:
     def run_lengths(
         payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8]

@@ -83,16 +83,23 @@ def played() -> Iterator[Played]:
 
 
 @pytest.mark.parametrize("by_cycle", [True, False])
-def test_a_silent_kind_of_frame_makes_exactly_its_sensors_stale(played: Played, by_cycle: bool) -> None:
-    play = played(Layout(FRAMES), skin(Module([*taxels(4), THERMAL])), 0.02, by_cycle=by_cycle)
-    play.run(1000, [(TAXELS, 8, 20)])
-    assert play.status == [0, 0, 0, 0, Status.NEVER_SEEN]
-    play.run(1000, [(TAXELS, 8, 20), (THERMOMETER, 2, 20)])
-    assert play.status == [0] * 5
-    play.run(1000, [(TAXELS, 8, 20)])
-    assert play.status == [0, 0, 0, 0, Status.STALE]
-    play.run(1000, [(THERMOMETER, 2, 20)])
-    assert play.status == [Status.STALE] * 4 + [0]
+@pytest.mark.parametrize("at", [0, 4])
+def test_a_silent_kind_of_frame_makes_exactly_its_sensors_stale(played: Played, at: int, by_cycle: bool) -> None:
+    pressures = [channel for channel in range(5) if channel != at]
+    frames = [
+        Frame("taxels", [Identifier(TAXELS)], [8], Values(0, "<i2", 4, to=pressures)),
+        Frame("temperature", [Identifier(THERMOMETER)], [2], Values(0, "<i2", 1, to=[at])),
+    ]
+    sensors = taxels(4)
+    play = played(Layout(frames), skin(Module([*sensors[:at], THERMAL, *sensors[at:]])), 0.02, by_cycle=by_cycle)
+    for senders, taxels_are, temperature_is in (
+        ([(TAXELS, 8, 20)], 0, Status.NEVER_SEEN),
+        ([(TAXELS, 8, 20), (THERMOMETER, 2, 20)], 0, 0),
+        ([(TAXELS, 8, 20)], 0, Status.STALE),
+        ([(THERMOMETER, 2, 20)], Status.STALE, 0),
+    ):
+        play.run(1000, senders)
+        assert play.status == [temperature_is if channel == at else taxels_are for channel in range(5)]
 
 
 SLOW = [FRAMES[0], Frame("temperature", [Identifier(THERMOMETER)], [2], Values(0, "<i2", 1, to=[4]), period_s=1.0)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -231,6 +232,18 @@ def test_a_cycle_that_takes_the_maximum_age_is_shown_and_one_that_takes_longer_i
             pair.feed([(0, begin_ns, 0x100, bytes(8)), (0, begin_ns + 100 * MS + longer_ns, 0x110, bytes(8))])
             assert counted(pair) == expected
             begin_ns += PERIOD_NS
+
+
+def test_a_patch_that_begins_again_is_neither_out_of_time_nor_has_it_lost_anything() -> None:
+    layout = halves()
+    layout = Layout([replace(frame, sequence=SequenceNumber(0, "u1")) for frame in layout.frames], layout.cycles[0])
+    with decoding(layout, skin([Module(taxels(2), key=0)], n_buses=2)) as (pair, begin_ns):
+        for number in (200, 0):
+            rows = [(bus, place) for bus in range(2) for place in range(2)]
+            pair.feed([(bus, begin_ns + place, 0x100 | place << 4, bytes([number] * 8)) for bus, place in rows])
+            begin_ns += 7 * PERIOD_NS // 2
+            pair.do(lambda way: way.decoder.forget(1))
+        assert [counted(pair, patch) for patch in range(2)] == [{"updates": 1, "orphans": 2, "late": 1}, {"updates": 2}]
 
 
 def test_what_can_be_part_of_no_cycle_any_more_is_an_orphan_at_once() -> None:

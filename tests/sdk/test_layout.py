@@ -353,19 +353,6 @@ def test_sequence_numbers_in_long_words(sequence: SequenceNumber) -> None:
     assert (lost, repeated, back) == ((2, 1, 0) if sequence.modulo else (0, 1, 1))
 
 
-def test_sequence_numbers_of_a_restarted_patch_are_no_loss() -> None:
-    layout = one(Values(2, "u1", 1), sequence=SequenceNumber(0, "<u2"))
-    decoder = decode(layout, [Module(taxels(1))], "u1", [(0x100, (40000).to_bytes(2, "little") + bytes(6))])
-    decoder.forget(0)
-    batch = FrameBatch(16, 8, decoder.compiled.headroom)
-    decoder.put_back(batch)
-    batch.append(0, 1, 0x100, bytes(8))
-    decoder.decode(batch)
-    counters = dict(zip(PATCH_COUNTERS, decoder.state.patch_counters[0].tolist(), strict=True))
-    assert counters["updates"] == 2
-    assert sum(counters.values()) == 2
-
-
 def test_expand_is_the_escape() -> None:
     def run_lengths(
         payload: npt.NDArray[np.uint8], length: npt.NDArray[np.uint8]

@@ -124,7 +124,6 @@ class Emulation:
         self._outbox: deque[WireFrame] = deque()
         self._batch = FrameBatch(256, bus.payload_size)
         self._open = False
-        self._due_ns: int | None = None
         self._backoff_ns = _FIRST_BACKOFF_NS
         self.send_failures: int = 0
         """Number of dropped frames."""
@@ -174,7 +173,7 @@ class Emulation:
             except BusNotAvailable:
                 self._backoff_ns = min(2 * self._backoff_ns, _LONGEST_BACKOFF_NS)
                 return now_ns + self._backoff_ns
-            self._open, self._due_ns = True, None
+            self._open = True
             self._hardware.skip(now_ns)
             self._report("bus_up")
             return now_ns
@@ -195,8 +194,7 @@ class Emulation:
             return now_ns + self._backoff_ns
 
     def _send(self, now_ns: int) -> int | None:
-        self._outbox += due_frames(self._hardware, self._due_ns, now_ns)[0]
-        self._due_ns = self._hardware.next_due_ns()
+        self._outbox += due_frames(self._hardware, now_ns)[0]
         if self._outbox:
             self._latest_ns = max(self._latest_ns, self._clock() - self._outbox[0].time_ns)
         while self._outbox:
@@ -208,7 +206,7 @@ class Emulation:
                     self.send_failures += 1
                 return now_ns + _RETRY_NS
             self._outbox.popleft()
-        return self._due_ns
+        return self._hardware.next_due_ns()
 
     def _totals(self) -> dict[str, int]:
         """Return the counts, and how late a frame was at most since the last call, in whole ms."""

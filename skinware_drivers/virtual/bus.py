@@ -104,7 +104,6 @@ class VirtualCanBus(EmulatedBus):
         self._wire = self.hardware.wire if isinstance(self.hardware, Stage) else None
         self.bit_rate: int = self._wire.bit_rate if self._wire else 0
         self._timer: Timer | None = None
-        self._due_ns: int | None = None
         self._pending: list[WireFrame] = []
         self._next_error: BusError | None = None
 
@@ -142,7 +141,7 @@ class VirtualCanBus(EmulatedBus):
             raise BusNotAvailable(f"{self.name} is not open")
         now_ns = self._clock()
         if len(self._pending) < batch.free:
-            frames, too_old = due_frames(self.hardware, self._due_ns, now_ns)
+            frames, too_old = due_frames(self.hardware, now_ns)
             self.counters.dropped += too_old
             for frame in frames:
                 if len(frame.payload) <= self.payload_size:
@@ -208,8 +207,7 @@ class VirtualCanBus(EmulatedBus):
 
     def _wake_when_due(self) -> None:
         """Become readable when a frame is due; at once while some wait."""
-        self._due_ns = self.hardware.next_due_ns()
-        self._wake_at(_AT_ONCE if self._pending else self._due_ns)
+        self._wake_at(_AT_ONCE if self._pending else self.hardware.next_due_ns())
 
     def _wake_at(self, time_ns: int | None) -> None:
         if self._timer is not None:
@@ -280,7 +278,6 @@ class EmulatedPort(Port):
     def __init__(self, hardware: EmulatedHardware, clock: Clock) -> None:
         self._hardware, self._clock, self._timer = hardware, clock, clock.timer()
         self._unread: deque[WireFrame] = deque()
-        self._due_ns: int | None = None
         self._is_away = False
         hardware.skip(clock())
         self._wake_when_due()
@@ -291,7 +288,7 @@ class EmulatedPort(Port):
     def read(self, size: int) -> bytes:
         if self._is_away:
             raise BusNotAvailable("the emulated line went away, perhaps unplugged")
-        self._unread += due_frames(self._hardware, self._due_ns, self._clock())[0]
+        self._unread += due_frames(self._hardware, self._clock())[0]
         if getattr(self._hardware, "datagrams", False):
             data = self._unread.popleft().payload if self._unread else b""
         else:
@@ -316,8 +313,7 @@ class EmulatedPort(Port):
         self._timer.wake_at(0)
 
     def _wake_when_due(self) -> None:
-        self._due_ns = self._hardware.next_due_ns()
-        self._timer.wake_at(_AT_ONCE if self._unread else self._due_ns)
+        self._timer.wake_at(_AT_ONCE if self._unread else self._hardware.next_due_ns())
 
 
 BUSES: dict[str, type[EmulatedBus]] = {

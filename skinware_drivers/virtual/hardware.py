@@ -246,13 +246,9 @@ def emulators_instead(medium: str) -> str:
     return f"; emulators that fit: {', '.join(fitting)}" if fitting else ""
 
 
-def due_frames(hardware: EmulatedHardware, due_ns: int | None, now_ns: int) -> tuple[list[WireFrame], int]:
-    """Return the frames that are due, and how many are dropped for their age, as from a full receive buffer.
-
-    Args:
-        due_ns: when the first was due, as the hardware said; None: it was silent.
-    """
-    too_old = 0
+def due_frames(hardware: EmulatedHardware, now_ns: int) -> tuple[list[WireFrame], int]:
+    """Return the frames that are due, and how many are dropped for their age, as from a full receive buffer."""
+    due_ns, too_old = hardware.next_due_ns(), 0
     if due_ns is not None and due_ns < now_ns - _LONGEST_BACKLOG_NS:
         too_old = hardware.skip(now_ns - _LONGEST_BACKLOG_NS)
     return hardware.emit(now_ns), too_old

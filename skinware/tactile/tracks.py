@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from skinware import native
 from skinware.tactile.arrays import Doubles, Flags, Whole
 
-Tracks = npt.NDArray[np.void]
+Tracks: TypeAlias = Any
+"""Array with the fields of ``TRACK``; checking the types of its sums as those of arrays takes mypy seconds."""
 
 LONGEST_GUESS_S = 0.1
 """Seconds for which a velocity is extrapolated."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -211,7 +211,7 @@ def _largest(taxels: Whole, contact: Whole, load: Doubles, count: int, listed: F
     return taxels[is_kept], number[is_kept], load[is_kept]
 
 
-Patterns = npt.NDArray[np.void]
+Patterns: TypeAlias = Any  # an array with fields; as such it takes mypy seconds
 
 _SIGMA = 5.0
 """Standard deviations of its noise by which a pattern must have moved: by chance once an hour."""

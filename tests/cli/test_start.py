@@ -39,3 +39,25 @@ def test_closed_streams_lead_nowhere_and_keep_their_descriptors(tmp_path: Path) 
     program = "import skinware_start; skinware_start._Function('closed.main')()"
     closing = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh"]
     assert subprocess.run([*closing, sys.executable, "-c", program], cwd=tmp_path, check=False).returncode == 0
+
+
+def test_an_interrupt_that_a_destructor_drops_comes_again() -> None:
+    program = """
+import os, signal, time
+import click
+from skinware.cli import _command as cli
+
+class Dropping:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+@click.command("skin-try")
+def command():
+    Dropping()
+    click.echo("goes on", nl=True)
+    time.sleep(60)
+
+cli.run(command)
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=30)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "goes on\n", "")

@@ -283,14 +283,16 @@ class RingReader(Generic[SampleT]):
                 times.append((sequence, time_ns))
         return times
 
-    def view(self) -> SampleT | None:
-        """Return the newest sample in place, without a copy; ask ``frame.valid`` after using it."""
-        for _ in range(COPY_ATTEMPTS):
-            wanted = self.latest
+    def view(self, sequence: int | None = None) -> SampleT | None:
+        """As ``copy``, but in place, without a copy; ask ``frame.valid`` after using it."""
+        for _ in range(COPY_ATTEMPTS if sequence is None else 1):
+            wanted = self.latest if sequence is None else sequence
             if wanted == 0:
                 return None
             slot = wanted % self.slot_count
             frame = self.frame_class(self, self._slots[slot], in_ring=self._slot_words[slot])
             if frame.sequence == wanted and frame.valid:
                 return frame
+        if sequence is not None:
+            return None
         raise self._overrun()

@@ -298,6 +298,26 @@ def wake_word_of(reader: ServiceReader[Any]) -> tuple[Word, int]:
     return ring.wake_word, ring.wake_count
 
 
+def samples_after(
+    reader: ServiceReader[SampleT], position: Position | None, *, in_place: bool = False
+) -> Iterator[SampleT]:
+    """Yield the samples after a position that the generation at hand has; without a position the newest. Never wait.
+
+    Args:
+        in_place: do not copy them; ask ``valid`` of each after using it.
+    """
+    ring = reader._ring  # noqa: SLF001
+    take, first, latest = ring.view if in_place else ring.copy, 1, ring.latest
+    if position is None:
+        first = max(first, latest)
+    elif position[0] == ring.generation:
+        first = position[1] + 1
+    for sequence in range(max(first, latest - ring.slot_count + 2), latest + 1):
+        sample = take(sequence)
+        if sample is not None:
+            yield sample
+
+
 class Tap(ServiceReader[SampleT]):
     """A reader whose owner looks for new generations and for the dead, and waits for many readers at once."""
 

@@ -20,7 +20,7 @@ from skinware.tactile.contacts_service import ContactsReader, ContactsSample
 from skinware.tactile.motion import MotionReader, MotionSample
 from skinware.tactile.source_service import SourceReader
 from skinware.views.history import DriverRest, RecentValues
-from skinware.views.live import EverySnapshot, LiveDriver, LiveDrivers, LiveSources
+from skinware.views.live import LiveDriver, LiveDrivers, LiveSources
 from skinware.views.quantities import Newest, Quantity, quantities_of
 from skinware.views.robot import Robot
 from skinware.views.scene import Scene
@@ -78,9 +78,12 @@ class Origin:
                 services.look()
         return self.live.look()
 
+    def calmed(self, driver: str) -> LiveDriver | None:
+        return None if self._calm is None else self._calm.get(driver)
+
     def is_due(self, live: LiveDriver) -> bool:
         """Return whether the newest snapshot of a driver may be shown: its calmed one is here, or will not follow."""
-        frame, calm = live.frame, None if self._calm is None else self._calm.get(live.name)
+        frame, calm = live.frame, self.calmed(live.name)
         if frame is None or calm is None or self._calm is None:
             return frame is not None
         self._calm.poll(calm)
@@ -89,7 +92,7 @@ class Origin:
 
     def about(self, driver: str) -> tuple[DriverSnapshot | None, ContactsSample | None, MotionSample | None]:
         """Return the newest snapshot of a calmed driver, contacts and motion; None where no living service has one."""
-        live = None if self._calm is None else self._calm.get(driver)
+        live = self.calmed(driver)
         calm = None if live is None or live.frame is None or live.frame.stale else live.frame
         contacts = next((sample for source in self._contacts if (sample := source.of(driver)) is not None), None)
         motion = next((found for source in self._motion if (found := source.of(driver)) is not None), None)
@@ -141,7 +144,6 @@ class ShownDriver:
         self.since_ns: dict[tuple[object, ...], int] = {}
         self.taken_ns = self._judged_ns = 0
         self.newest: Newest | None = None
-        self._every = EverySnapshot(live.name)
         self.structure, self.generation = live.structure, live.reader.generation
         self.quantities = quantities_of(self.structure)
         self.past, self.rest = RecentValues(self.structure.n_sensors, self.structure.dtype), DriverRest(self.structure)
@@ -169,13 +171,14 @@ class ShownDriver:
         report = report_of(
             live.reader, self.frame, live.rate_hz, live.patch_rates_hz, life=self.life, status=self.status
         )
-        if self._stands_still(life_of(live.reader, self.frame)):
+        if self._stands_still:
             patches = tuple(replace(patch, rate_hz=None, age_ns=None) for patch in report.patches)
             report = replace(report, rate_hz=None, age_ns=None, patches=patches)
         return report
 
-    def _stands_still(self, life: str) -> bool:
-        return life == PAUSED and self.origin.recording is not None
+    @property
+    def _stands_still(self) -> bool:
+        return self.origin.recording is not None and life_of(self.live.reader, self.frame) == PAUSED
 
     def take(self, frame: DriverSnapshot) -> None:
         if frame.structure is not self.structure and frame.structure != self.structure:
@@ -197,7 +200,7 @@ class ShownDriver:
         if before is None or now_ns() - self._judged_ns < _JUDGE_EVERY_NS:
             return
         before_life, life = self.life, life_of(self.live.reader, before.frame)
-        stands_still = self._stands_still(life)
+        stands_still = self._stands_still
         self.life = before_life if stands_still else life
         self.newest = self._judged(before.frame, before.status if stands_still else status_now(life, before.frame))
         if (
@@ -206,9 +209,6 @@ class ShownDriver:
             or self.newest.contacts_position != before.contacts_position
         ):
             self.changes += 1
-
-    def close(self) -> None:
-        self._every.close()
 
     def _judged(self, frame: DriverSnapshot, status: npt.NDArray[np.uint8], *, is_newer: bool = False) -> Newest:
         self._judged_ns = now_ns()
@@ -220,10 +220,9 @@ class ShownDriver:
             calm = None  # it has other sensors
         if calm is not None:
             status = status | (calm.status & _UNHEALTHY)
-        origin, last = self.origin, calm or frame
-        namespace = origin.namespace if calm is None or origin.calm is None else origin.calm
+        live, last = self.origin.calmed(self.live.name) if calm is not None else self.live, calm or frame
         before = (self.newest.calm or self.newest.frame).position if self.newest is not None else None
-        read_all = partial(self._every.until, last, namespace, before) if is_newer else lambda: [last]
+        read_all = partial(live.until, last, before) if is_newer and live is not None else lambda: [last]
         return Newest(frame, status, calm, contacts, motion, read_all)
 
 
@@ -270,14 +269,11 @@ class Follower:
         if self._found != found:
             self._found = found
             kept = {id(driver.live): driver for driver in self.drivers}
-            gone, self.drivers = self.drivers, []
+            self.drivers = []
             for origin, lives in zip(self.origins, found, strict=True):
                 for live in lives:
                     number = self._numbers.setdefault((origin.title, live.name), len(self._numbers))
                     self.drivers.append(kept.get(id(live)) or ShownDriver(number, live, origin))
-            for driver in gone:
-                if driver not in self.drivers:
-                    driver.close()
             self._arrange()
         generations = [driver.generation for driver in self.drivers]
         newer = [driver for driver in self.drivers if self._take(driver, period_ns)]
@@ -286,8 +282,6 @@ class Follower:
         return newer
 
     def close(self) -> None:
-        for driver in self.drivers:
-            driver.close()
         for origin in self.origins:
             origin.close()
         self.drivers = []

@@ -20,7 +20,6 @@ from skinware.errors import (
     ConfigurationError,
     NamespaceError,
     Overrun,
-    ServiceError,
     ServiceNotFound,
     ServiceTimeout,
     StructureError,
@@ -29,7 +28,7 @@ from skinware.memory.futex import Word
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import SampleT
 from skinware.realtime import NS_PER_S
-from skinware.service._reader import wake_word_of
+from skinware.service._reader import samples_after, wake_word_of
 from skinware.skin import Skin
 from skinware.state import DriverReport, report_of
 from skinware.structure import Structure
@@ -95,6 +94,16 @@ class LiveDriver:
         rates: list[float | None] = (updates / np.maximum(modules, 1) / passed_s).tolist()
         return rates
 
+    def until(self, newest: DriverSnapshot, after: tuple[int, int] | None) -> list[DriverSnapshot]:
+        """Return the snapshots after a position, ``newest`` last; those that the ring still has, of one generation."""
+        found: deque[DriverSnapshot] = deque(maxlen=_MOST_BETWEEN)
+        with contextlib.suppress(Overrun):
+            for snapshot in () if after is None else samples_after(self.reader, after):
+                if snapshot.position >= newest.position:
+                    break
+                found.append(snapshot)
+        return [*(snapshot for snapshot in found if snapshot.generation == newest.generation), newest]
+
     def report(self) -> DriverReport:
         return report_of(self.reader, self.frame, self.rate_hz, self.patch_rates_hz)
 
@@ -114,40 +123,6 @@ class LiveDriver:
         """Return the time between the first and the last count, s; 0 if it is too short to measure a rate."""
         passed_ns = self._counts[-1].time_ns - self._counts[0].time_ns if self._counts else 0
         return passed_ns / NS_PER_S if passed_ns >= _RATE_WINDOW_NS // 4 else 0.0
-
-
-class EverySnapshot:
-    """The snapshots of a driver between two that are shown, for what no picture may miss."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._reader: DriverReader | None = None
-
-    def until(
-        self, newest: DriverSnapshot, namespace: Namespace, after: tuple[int, int] | None
-    ) -> list[DriverSnapshot]:
-        """Return those after a position, ``newest`` last; only those that the ring still has, of one generation."""
-        if self._reader is not None and self._reader.namespace is not namespace:
-            self.close()
-        found: deque[DriverSnapshot] = deque(maxlen=_MOST_BETWEEN)
-        try:
-            if self._reader is None:
-                self._reader = DriverReader(self._name, namespace=namespace, announce=False)
-            for snapshot in self._reader.in_order(timeout_s=0.0):
-                if snapshot.position >= newest.position:
-                    break
-                if after is not None and snapshot.position > after:
-                    found.append(snapshot)
-        except (ServiceTimeout, Overrun):
-            pass
-        except ServiceError:
-            self.close()
-        return [*(snapshot for snapshot in found if snapshot.generation == newest.generation), newest]
-
-    def close(self) -> None:
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
 
 
 class LiveDrivers:

@@ -12,11 +12,12 @@ import numpy.typing as npt
 
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
-from skinware.errors import Overrun, ServiceError, ServiceTimeout
+from skinware.errors import ServiceError, StructureChanged
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import ServiceReader
+from skinware.service._reader import samples_after
 from skinware.status import Status
 from skinware.structure import Structure
 from skinware.tactile.contacts_service import ContactsReader
@@ -89,11 +90,10 @@ class _Feed:
     def __init__(self, source: _PlotSource) -> None:
         reader = ContactsReader if source.of == "contacts" else DriverReader
         self.reader: ServiceReader[Any] = reader(source.name, namespace=source.namespace, announce=False)
-        self._samples = self.reader.in_order(timeout_s=0.0)
         self.of, self.number = source.of, 0
         self.lines: dict[int, Line] = {}
         self.rows = PlotRows(_MOST_SAMPLES)
-        self._values: Callable[[Any], Values] = lambda _: np.zeros(0)
+        self._values: Callable[[list[Any]], Values] = lambda samples: np.zeros((len(samples), 0))
 
     def choose(
         self, number: int, lines: dict[int, Line], driver: ShownDriver, functions: Mapping[str, PlotFunction]
@@ -104,15 +104,14 @@ class _Feed:
 
     def take(self) -> bool:
         """Take the newer samples, and return whether some wait; raise what the reader raises."""
-        latest = self.reader.refresh()
-        if latest is not None and latest != self.rows.last:
-            try:
-                for sample in self._samples:
-                    self.rows.add(sample.position, sample.published_ns, self._values(sample))
-                    if sample.position >= latest:
-                        break
-            except (ServiceTimeout, Overrun):
-                self._samples = self.reader.in_order(timeout_s=0.0)
+        if self.reader.newest_position in (None, self.rows.last):
+            self.reader.refresh()
+            if self.reader.structure_changed:
+                raise StructureChanged(self.reader.name)
+        samples = list(samples_after(self.reader, self.rows.last, in_place=self.of != "function"))
+        for sample, values in zip(samples, self._values(samples) if samples else (), strict=True):
+            if sample.valid:
+                self.rows.add(sample.position, sample.published_ns, values)
         return len(self.rows) > 0
 
     def block(self) -> PlotBlock:
@@ -222,25 +221,25 @@ def _units_of(structure: Structure, sensors: Sensors) -> tuple[Values, Values]:
 
 def values_of(
     of: str, lines: list[Line], driver: ShownDriver, functions: Mapping[str, PlotFunction]
-) -> Callable[[Any], Values]:
-    """Return a function of a sample of a driver or of contacts: (m,) the values of lines."""
+) -> Callable[[list[Any]], Values]:
+    """Return a function of k samples of a driver or of contacts: (k, m) the values of lines."""
     if of == "contacts":
         ids = [line.contact for line in lines]
 
-        def loads(sample: Sample) -> Values:
+        def loads(sample: Sample) -> list[float]:
             filled = slice(0, int(sample.column("count")[0]))
             known = dict(zip(sample.column("id")[filled].tolist(), sample.column("load")[filled].tolist(), strict=True))
-            return np.array([known.get(contact, np.nan) for contact in ids])
+            return [known.get(contact, np.nan) for contact in ids]
 
-        return loads
+        return lambda samples: np.array([loads(sample) for sample in samples])
     if of == "function":
         names = [line.function or "" for line in lines]
-        return lambda frame: np.array([functions[name](frame) for name in names])
+        return lambda frames: np.array([[functions[name](frame) for name in names] for frame in frames])
     return _totals(driver, lines)
 
 
-def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot], Values]:
-    """Return a function of a snapshot: (m,) the sums of the values of each line's sensors; the highest of pressures."""
+def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[list[DriverSnapshot]], Values]:
+    """Return a function of k snapshots: (k, m) sums of the values of each line's sensors; the highest of pressures."""
     of_lines = [_sensors_of(driver, line) for line in lines]
     has_sensors = np.array([len(sensors) > 0 for sensors in of_lines], bool)
     some = [sensors for sensors in of_lines if len(sensors)]
@@ -251,21 +250,20 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[DriverSnapshot]
     highest = np.array([one is not None and one.total == "highest" for one in quantities], bool)[has_sensors]
     is_each = len(some) == len(at) == len(lines)  # a sensor each
 
-    def totals(frame: DriverSnapshot) -> Values:
-        values: Values = frame.values[at] * scale + offset
-        without = frame.status[at] & _NO_VALUE
-        if without.any():
-            values[without != 0] = np.nan
+    def totals(frames: list[DriverSnapshot]) -> Values:
+        values: Values = np.array([frame.values[at] for frame in frames]) * scale + offset
+        values[np.array([frame.status[at] for frame in frames]) & _NO_VALUE != 0] = np.nan
         if is_each:
             return values
-        found = np.full(len(lines), np.nan)
+        found = np.full((len(frames), len(lines)), np.nan)
         if not some:
             return found
         unknown = np.isnan(values)
         values[unknown] = 0
-        of_lines = np.where(highest, np.maximum.reduceat(values, starts), np.add.reduceat(values, starts))
-        of_lines[np.logical_and.reduceat(unknown, starts)] = np.nan
-        found[has_sensors] = of_lines
+        sums, most = (add.reduceat(values, starts, axis=1) for add in (np.add, np.maximum))
+        of_lines = np.where(highest, most, sums)
+        of_lines[np.logical_and.reduceat(unknown, starts, axis=1)] = np.nan
+        found[:, has_sensors] = of_lines
         return found
 
     return totals

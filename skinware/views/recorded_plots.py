@@ -112,12 +112,14 @@ class RecordedPlots:
             values = values_of(part.of, list(part.lines.values()), drivers[0], self._follower.functions)
             rows = PlotRows()
             try:
-                self._read_rows(part, _only(drivers[0].structure, values) if part.of != "contacts" else values, rows)
+                self._read_rows(part, _fits(None if part.of == "contacts" else drivers[0].structure), values, rows)
             except (SkinwareError, OSError):  # the replay reports it
                 continue
             self._blocks.append(rows.block(number, part.of, list(part.lines), begins=part.begins))
 
-    def _read_rows(self, part: _Part, values: Callable[[Any], Values | None], rows: PlotRows) -> None:
+    def _read_rows(
+        self, part: _Part, fits: Callable[[Any], bool], values: Callable[[list[Any]], Values], rows: PlotRows
+    ) -> None:
         title, (first_s, last_s) = part.played.title, part.stretch
         recording = self._recordings.get(title)
         if recording is None:
@@ -126,9 +128,11 @@ class RecordedPlots:
             recording = self._recordings.setdefault(title, skinware.recording.open(part.played.file))
         track, is_end = recording[part.service], last_s >= recording.duration_s
         for contents in recording.chunks({track.channel}, first_s, None if is_end else last_s):
-            for time_s, sample in track.samples_in(contents):
-                if first_s <= time_s and (is_end or time_s < last_s) and (found := values(sample)) is not None:
-                    rows.add(sample.position, round(time_s * NS_PER_S), found)
+            samples = track.samples_in(contents)
+            taken = [(t, s) for t, s in samples if first_s <= t and (is_end or t < last_s) and fits(s)]
+            found = values([sample for _, sample in taken]) if taken else ()
+            for (time_s, sample), row in zip(taken, found, strict=True):
+                rows.add(sample.position, round(time_s * NS_PER_S), row)
             if self._is_over:
                 return
 
@@ -141,14 +145,14 @@ def _source_of(driver: ShownDriver, line: Line) -> tuple[str, str] | None:
     return None if reader is None else (reader.name, "contacts")
 
 
-def _only(structure: Structure, values: Callable[[Any], Values]) -> Callable[[Any], Values | None]:
-    """Return a function of snapshots: their values; None where they have other sensors."""
+def _fits(structure: Structure | None) -> Callable[[Any], bool]:
+    """Return a function of samples: whether they have the sensors of a structure; True without one."""
     known: dict[int, bool] = {}
 
-    def found(frame: Any) -> Values | None:
-        key = id(frame.structure)
+    def fits(sample: Any) -> bool:
+        key = id(sample.context)
         if key not in known:
-            known[key] = frame.structure == structure
-        return values(frame) if known[key] else None
+            known[key] = structure is None or sample.context == structure
+        return known[key]
 
-    return found
+    return fits

@@ -20,7 +20,7 @@ from skinware.memory.statistics import BUCKETS, Spread, bucket_of
 from skinware.realtime import NS_PER_S, now_ns
 from skinware.service import _attachment, _taking
 from skinware.service import _reader as reader_module
-from skinware.service._reader import Tap
+from skinware.service._reader import Tap, samples_after
 from skinware.service._taking import Accounts
 from tests.cli.fake_skin import fake_structure
 from tests.core.services import SMALL, at_0, kill, publish
@@ -114,6 +114,38 @@ def test_turns_of_a_loop_are_taken_in_c_and_counted() -> None:
         publish(writer, 6)
         assert next(samples).sequence == 6
         assert (reader.missed, reader.statistics.frames) == (1, 6)
+
+
+@pytest.mark.parametrize("in_place", [False, True])
+def test_samples_after_a_position_are_those_that_the_ring_has(in_place: bool) -> None:
+    def found(position: tuple[int, int] | None) -> list[int]:
+        samples = list(samples_after(reader, position, in_place=in_place))
+        assert all(sample.valid for sample in samples)
+        assert [int(sample.column("values")[0]) for sample in samples] == [sample.sequence for sample in samples]
+        return [sample.sequence for sample in samples]
+
+    with ServiceWriter("x", SMALL, slots=8) as writer, ServiceReader[Sample]("x") as reader:
+        assert found(None) == found((reader.generation, 0)) == []
+        for sequence in range(1, 6):
+            publish(writer, sequence)
+        assert found(None) == [5]
+        assert found((reader.generation, 2)) == [3, 4, 5]
+        assert found((reader.generation, 5)) == found((reader.generation, 99)) == []
+        assert found((reader.generation - 1, 3)) == [1, 2, 3, 4, 5]  # another generation
+        for sequence in range(6, 21):
+            publish(writer, sequence)
+        assert found((reader.generation, 2)) == list(range(14, 21))  # the others were overwritten
+
+
+def test_a_sample_in_place_is_not_valid_once_it_is_overwritten() -> None:
+    with ServiceWriter("x", SMALL, slots=8) as writer, ServiceReader[Sample]("x") as reader:
+        publish(writer, 1)
+        (sample,) = samples_after(reader, None, in_place=True)
+        for value in range(2, 9):
+            publish(writer, value)
+            assert (sample.valid, int(sample.column("values")[0])) == (True, 1)
+        publish(writer, 9)
+        assert (sample.valid, int(sample.column("values")[0])) == (False, 9)
 
 
 def test_a_tap_says_that_it_reads_in_order_and_reports_what_c_took() -> None:

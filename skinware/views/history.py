@@ -124,11 +124,6 @@ class RecentValues:
         rows = rows[times >= times.max(initial=0) - LENGTH_S * NS_PER_S]
         return self._time_ns[rows], self._values[rows, position]
 
-    def noise(self, position: int) -> float:
-        """Return the standard deviation of raw values of a sensor between snapshots; NaN before the third."""
-        values = self.series(position)[1].astype(np.float64)
-        return float(np.diff(values).std()) / math.sqrt(2) if len(values) > 2 else math.nan
-
 
 class WipeTest:
     """How far every sensor of a driver has moved while a hand goes over the whole skin.

@@ -281,7 +281,6 @@ class Viewer:
             "value": of_type.offset + of_type.scale * raw,
             "raw": raw,
             "age_ms": round((now_ns() - time_ns) / 1e6, 3) if time_ns else None,
-            "noise": abs(of_type.scale) * driver.past.noise(position),
             "status": int(driver.newest.marked[position]),
             "why": why_text(int(driver.newest.why[position])),
             "untouched": bool(frame.module_untouched[structure.sensor_module[position]]),

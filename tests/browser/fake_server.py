@@ -308,6 +308,5 @@ class FakeServer:
             "value": float(driver.levels[position]),
             "raw": int(driver.levels[position]),
             "age_ms": 4.2,
-            "noise": 0.8,
             "status": int(driver.status[position]),
         }

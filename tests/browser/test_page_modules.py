@@ -259,6 +259,14 @@ def test_a_line_shows_the_extremes_of_each_column(tell: Callable[..., Any]) -> N
     assert tell("curves.js", f"m.rangeOf({line})", times, [None] * 1301) is None
 
 
+def test_the_noise_of_a_line_has_no_slope_and_no_gaps(tell: Callable[..., Any]) -> None:
+    noise = "m.noiseOf(Float64Array.from(a[0], x => x ?? NaN))"
+    assert tell("curves.js", noise, list(range(9))) == 0
+    assert tell("curves.js", noise, [0, 1] * 500) == pytest.approx(1 / np.sqrt(2), rel=0.01)
+    assert tell("curves.js", noise, [0, 1, None, 2]) is None
+    assert tell("curves.js", noise, []) is None
+
+
 def test_ticks_are_round(tell: Callable[..., Any]) -> None:
     assert tell("curves.js", "m.ticksOf(-60, 0, 6)") == [-60, -50, -40, -30, -20, -10, 0]
     assert tell("curves.js", "m.ticksOf(0.012, 0.031, 4)") == [0.015, 0.02, 0.025, 0.03]

@@ -3,7 +3,8 @@
 import { h, setChildren, setHidden, setText } from "./dom.js";
 import { age, figure, measure, range } from "./format.js";
 import { markOf, NO_ACK, statusText } from "./marks.js";
-import { pathOf, piecesOf, rangeOf } from "./curves.js";
+import { noiseOf, pathOf, piecesOf, rangeOf } from "./curves.js";
+import { placeOf } from "./series.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const ROWS = ["raw", "age", "noise", "uid", "driver"];
@@ -60,7 +61,6 @@ class Card {
     this.status.dataset.fresh = String(status === 0 && !isOld);
     setText(this.cells.raw, figure(past ? null : shown?.raw));
     setText(this.cells.age, age(past ? null : shown?.age_ms));
-    setText(this.cells.noise, past ? figure(null) : measure(shown?.noise, sheet.unit));
     setText(this.cells.uid, `0x${sheet.uid[i].toString(16)}`);
     setText(this.cells.driver, `${sheet.driver.name}, sensor ${probe.position}`);
     this.#draw();
@@ -72,8 +72,11 @@ class Card {
     const until_ns = this.plotting.until(this.probe);
     if (!series || this.drawn === until_ns) return;
     this.drawn = until_ns;
+    const { times, values } = series;
     const window = { from: this.drawn - 1e9 * SHOWN_S, to: this.drawn, width: WIDTH };
-    const pieces = piecesOf(series.times, series.values, window);
+    const pieces = piecesOf(times, values, window);
+    const shown = values.subarray(placeOf(times, window.from), placeOf(times, window.to + 1));
+    setText(this.cells.noise, measure(noiseOf(shown), this.probe.sheet.unit));
     const [low, high] = rangeOf(pieces) ?? [null, null];
     const yOf = (value) => (high === low ? HEIGHT / 2 : HEIGHT - MARGIN - ((value - low) / (high - low)) * (HEIGHT - 2 * MARGIN));
     this.line.setAttribute("d", pieces.map((piece) => pathOf(piece.map(([x, value]) => [x, yOf(value)]))).join(""));

@@ -71,6 +71,13 @@ export function rangeOf(pieces) {
   return low <= high ? [low, high] : null;
 }
 
+/** The standard deviation of values from sample to sample, of which a steady rise is no part; null before the third. */
+export function noiseOf(values) {
+  const steps = [...values.subarray(1)].map((value, k) => value - values[k]).filter(Number.isFinite);
+  const mean = steps.reduce((sum, step) => sum + step, 0) / steps.length;
+  return steps.length < 2 ? null : Math.sqrt(steps.reduce((sum, step) => sum + (step - mean) ** 2, 0) / steps.length / 2);
+}
+
 /** Round numbers from low to high, about `most` of them. */
 export function ticksOf(low, high, most) {
   const rough = (high - low) / Math.max(1, most);

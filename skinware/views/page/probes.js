@@ -7,7 +7,7 @@ const MOST_PINS = 12;
 class Probe {
   constructor(sheet, i) {
     this.letter = "";
-    this.exact = null; // {value, raw, age_ms, noise, status} of the server
+    this.exact = null; // {value, raw, age_ms, status} of the server
     this.key = keyOf(sheet, i);
     this.sheet = sheet;
     this.i = i;

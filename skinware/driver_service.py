@@ -110,6 +110,7 @@ class DriverReader(ServiceReader[DriverSnapshot]):
     """
 
     frame_class = DriverSnapshot
+    _tables: tuple[int, Mapping[str, npt.NDArray[Any]]] = 0, {}  # static columns of a generation
 
     @property
     def structure(self) -> Structure:
@@ -130,7 +131,9 @@ class DriverReader(ServiceReader[DriverSnapshot]):
         return self._counters(frame, "patch", self.structure.n_patches)
 
     def _counters(self, frame: DriverSnapshot, what: str, count: int) -> list[dict[str, int]]:
-        names, counts = counters_of(frame, self.static(), what, count)
+        if self._tables[0] != self.generation:
+            self._tables = self.generation, self.static()
+        names, counts = counters_of(frame, self._tables[1], what, count)
         return [dict(zip(names, row, strict=True)) for row in counts.tolist()]
 
     def _describe(self, attached: segments.Segment) -> Structure:

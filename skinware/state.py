@@ -8,6 +8,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -181,15 +182,18 @@ def report_of(
     report = DriverReport(reader.name, life, rate_hz, frame.age_ns, structure.n_sensors, statuses)
     if structure is not reader.structure and structure != reader.structure:
         return report
+    of_buses = (frame.bus_state.tolist(), frame.bus_reason.tolist(), frame.bus_load.tolist())
     buses = tuple(
         BusReport(
-            structure.buses[bus],
-            state_name(BusState, int(frame.bus_state[bus])),
-            state_name(BusReason, int(frame.bus_reason[bus])) if frame.bus_reason[bus] else None,
+            name,
+            state_name(BusState, state),
+            state_name(BusReason, reason) if reason else None,
             None if load in (LOAD_UNKNOWN, LOAD_FILTERED) else load / 1000,
             counters,
         )
-        for bus, (load, counters) in enumerate(zip(frame.bus_load.tolist(), reader.bus_counters(frame), strict=True))
+        for name, state, reason, load, counters in zip(
+            structure.buses, *of_buses, reader.bus_counters(frame), strict=True
+        )
     )
     sensors, fresh, dark, waiting = (
         np.bincount(patches, minlength=structure.n_patches).tolist()
@@ -201,12 +205,12 @@ def report_of(
         )
     )
     rates = patch_rates_hz if len(patch_rates_hz) == structure.n_patches else [None] * structure.n_patches
-    ages_ns, patch_buses = patch_ages_ns(frame), structure.patch_bus.tolist()
+    ages_ns, patch_buses, states = patch_ages_ns(frame), structure.patch_bus.tolist(), frame.patch_state.tolist()
     patches = tuple(
         PatchReport(
             name=structure.patch_names[patch],
             bus=patch_buses[patch],
-            state=state_name(PatchState, int(frame.patch_state[patch])),
+            state=state_name(PatchState, states[patch]),
             sensors=sensors[patch],
             fresh=fresh[patch],
             untouched=dark[patch],
@@ -275,7 +279,9 @@ def count_reasons(why: npt.NDArray[np.uint8]) -> dict[str, int]:
 
 def settling(frame: DriverSnapshot) -> npt.NDArray[np.bool_]:
     """Return (n_sensors,) bool: sensors of a calmed driver that were seen, and wait for their baselines."""
-    without: npt.NDArray[np.bool_] = (frame.why == Why.RELEARNING) & ((frame.status & np.uint8(Status.NEVER_SEEN)) != 0)
+    without: npt.NDArray[np.bool_] = (frame.why == np.uint8(Why.RELEARNING)) & (
+        (frame.status & np.uint8(Status.NEVER_SEEN)) != 0
+    )
     return without & (frame.sensor_time_ns > 0) if without.any() else without
 
 
@@ -300,6 +306,7 @@ def patch_ages_ns(frame: DriverSnapshot) -> list[int | None]:
     return [time_ns - newest if newest else None for newest in newest_ns.tolist()]
 
 
+@lru_cache
 def state_name(states: type[enum.IntEnum], number: int) -> str:
     """Return the name of a state of a patch or bus, or of a reason; an unknown number stays a number."""
     try:

@@ -58,14 +58,14 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
         "rate_hz": _rounded(report.rate_hz),
         "age_ms": _milliseconds(report.age_ns),
         "sensors": driver.structure.n_sensors,
-        "fresh": int(np.count_nonzero(driver.status == 0)),
+        "fresh": report.fresh,
         "dropped": report.counters.get("dropped", 0),
         "load": max(loads, default=None),
         "buses": [
             {
                 "name": bus.name,
-                "state": report.state_of(bus),
-                "bad": badness(report.state_of(bus)),
+                "state": (state := report.state_of(bus)),
+                "bad": badness(state),
                 "reason": bus.reason,
                 "load": bus.load,
             }
@@ -75,8 +75,8 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
             {
                 "name": patch.name,
                 "bus": report.buses[patch.bus].name,
-                "state": report.state_of(patch),
-                "bad": badness(report.state_of(patch)),
+                "state": (state := report.state_of(patch)),
+                "bad": badness(state),
                 "age_ms": _milliseconds(patch.age_ns),
                 "sensors": patch.sensors,
                 "fresh": patch.fresh,
@@ -138,7 +138,7 @@ def _marked(newest: Newest) -> Iterator[tuple[npt.NDArray[np.intp], str, str]]:
         yield np.flatnonzero(marked & ~newest.settling if bit == Status.NEVER_SEEN else marked), severity, text
     whys = newest.why
     for why, (severity, text) in _REASONS.items():
-        yield np.flatnonzero(whys == why), severity, text
+        yield np.flatnonzero(whys == np.uint8(why)), severity, text
 
 
 def problem_of_all(text: str) -> dict[str, Any]:

@@ -23,7 +23,8 @@ from skinware.service._reader import wake_word_of
 
 LOOK_EVERY_NS = NS_PER_S // 5
 """Time between two looks for services that came or went."""
-_REFUSED_FOR_NS, _NEVER_NS = 10 * NS_PER_S, 1 << 62
+_ALIVE_FOR_NS = NS_PER_S // 10
+_REFUSED_FOR_NS, _NEVER_NS = 60 * NS_PER_S, 1 << 62
 
 ReaderT = TypeVar("ReaderT", bound=ServiceReader[Any])
 
@@ -40,7 +41,7 @@ class Drivers(Generic[ReaderT]):
     """Keep one reader of every driver in a namespace, and close it when the driver has gone.
 
     Nothing here waits, and nothing runs by itself: call ``look`` now and then. A file that cannot be read, or is of
-    another kind, is tried again when it is replaced, and after ten seconds.
+    another kind, is tried again when it is replaced, and after a minute.
 
     Args:
         reader: makes a reader from a name and ``namespace=``. It raises
@@ -78,6 +79,7 @@ class Drivers(Generic[ReaderT]):
         self._inodes: dict[str, int] = {}  # of the last look
         self._refused: dict[str, _Refusal] = {}
         self._newest: dict[str, Sample] = {}
+        self._alive_until_ns: dict[str, int] = {}
 
     @property
     def unreadable(self) -> dict[str, str]:
@@ -159,14 +161,19 @@ class Drivers(Generic[ReaderT]):
         """Return the newest sample of a service, the same object while there is no newer one; never wait.
 
         Returns:
-            None if it is not followed, has published nothing since it began, or its writer is dead.
+            None if it is not followed, has published nothing since it began, or its writer died 0.1 s ago.
         """
-        newer = self.newest(name, newer_than=self._newest.get(name))
+        sample, reader = self._newest.get(name), self.readers.get(name)
+        is_newest = sample is not None and reader is not None and reader.newest_position == sample.position
+        if is_newest and now_ns() < self._alive_until_ns.get(name, 0):
+            return sample
+        newer = self.newest(name, newer_than=sample)
         if newer is not None:
             self._newest[name] = newer
         sample, reader = self._newest.get(name), self.readers.get(name)
         if sample is None or reader is None or not reader.alive or reader.newest_position is None:
             return None
+        self._alive_until_ns[name] = now_ns() + _ALIVE_FOR_NS
         return sample if sample.generation == reader.newest_position[0] else None
 
     def wake_words(self) -> list[tuple[futex.Word, int]]:

@@ -85,6 +85,7 @@ _BETWEEN_ISLANDS = 0.15
 """Gap between bodies, as a part of the width of the right one; at least some pitches."""
 _NOMINAL = "_nominal"
 """In the name of a coordinate frame that each driver has for itself, such as ``right_hand_nominal``."""
+_IDENTITY = np.eye(4)
 _BEHIND_M = 0.0015
 """Distance of outlines behind the taxels."""
 _SAME_PLACE_M = 1e-4
@@ -144,7 +145,7 @@ class Scene:
 
     def pose(self, driver: str, frame: str) -> Pose:
         """Return (4, 4), the place of a driver's coordinate frame; the identity for a frame without its taxels."""
-        return self._pose_of.get((driver, frame), np.eye(4))
+        return self._pose_of.get((driver, frame), _IDENTITY)
 
     def outlines(self, driver: str) -> list[Places]:
         """Return (k, 3) m: the corners of the fingers and palms of a driver's nominal hands, behind its taxels."""

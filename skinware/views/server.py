@@ -38,7 +38,10 @@ _LONGEST_S = 0.2
 """Between two looks while no viewer waits: the next one looks by itself when it asks."""
 _LONGEST_TURN_S = 0.5
 _PLOTS_EVERY_S = 0.09
-"""Between two draws of its plots by the page: samples for them are taken as rarely, unless their ring is too short."""
+"""Between two draws of its plots by the page: samples for them are taken as rarely, unless their ring is too short.
+
+What is no picture is followed then, too.
+"""
 _EARLY_S = 0.005
 """A turn may be sent this much earlier than the pace asks for."""
 _MOST_VIEWERS = 32
@@ -128,11 +131,8 @@ class ViewServer:
         try:
             for show in {viewer.show for viewer in self._viewers}:
                 self._take(show)
-            if self._viewers:
-                problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
-                self._doctor.follow([problem for problem in problems if NOTE not in problem])
-                for viewer in filter(self._is_due, self._viewers):
-                    self._send(viewer)
+            for viewer in filter(self._is_due, self._viewers):
+                self._send(viewer)
         except Exception as error:  # noqa: BLE001 - show() raises it
             self._failure.set_exception(error)
         else:
@@ -142,23 +142,26 @@ class ViewServer:
         """Follow once it is worth it: when a turn is due, and before a ring has lost what a plot wants."""
         pause_s = _LONGEST_S
         for viewer in self._viewers:
-            pause_s = min(pause_s, viewer.show.follower.slack_s / 2)
+            pause_s = min(pause_s, viewer.show.slack_s / 2)
             if viewer.wanted:
                 pause_s = min(pause_s, _next_s(viewer) - time.monotonic())
         self._timer = asyncio.get_running_loop().call_later(max(pause_s, _TICK_S), self._follow)
 
     def _take(self, show: Show) -> None:
         viewers = [viewer for viewer in self._viewers if viewer.show is show]
-        newer = show.follower.take(round(NS_PER_S / max(viewer.look.fps for viewer in viewers)))
-        is_plotting = time.monotonic() >= show.plots_due_s
-        if is_plotting:
-            show.plots_due_s = time.monotonic() + min(_PLOTS_EVERY_S, show.follower.slack_s / 4)
-        for viewer in viewers:
-            for driver in newer:
+        for driver in show.follower.take(round(NS_PER_S / max(viewer.look.fps for viewer in viewers))):
+            for viewer in viewers:
                 viewer.look.follow(driver)
-            if is_plotting:
-                viewer.plots.take()
+        if time.monotonic() < show.due_s:
+            return
+        show.slack_s = show.follower.slack_s
+        show.due_s = time.monotonic() + min(_PLOTS_EVERY_S, show.slack_s / 4)
+        for viewer in viewers:
+            viewer.plots.take()
         show.follow()
+        if show is self._live:
+            problems = [problem for driver in self._follower.drivers for problem in driver.since_ns]
+            self._doctor.follow([problem for problem in problems if NOTE not in problem])
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         try:

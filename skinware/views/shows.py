@@ -215,7 +215,8 @@ class Show:
         self, follower: Follower, played: Sequence[PlayedRecording] = (), problems: Sequence[str] = ()
     ) -> None:
         self.follower, self.played = follower, played
-        self.plots_due_s = 0.0  # when samples for plots are to be taken again, CLOCK_MONOTONIC
+        self.due_s = 0.0  # when samples for plots are to be taken again, CLOCK_MONOTONIC
+        self.slack_s = follower.slack_s
         self._problems = problems
         self._control = ReplayControl()
 

@@ -16,7 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware.realtime import NS_PER_S, now_ns
+from skinware.tactile.contacts import MOST
 from skinware.tactile.contacts_service import ContactsSample
+from skinware.tactile.source_service import Source
 from skinware.tactile.tracking import ContactKind
 from skinware.text import why_text
 from skinware.views import looks
@@ -35,6 +37,8 @@ _STATE_EVERY_NS = NS_PER_S
 _EXACT_EVERY_NS = NS_PER_S // 4
 """People read no more numbers."""
 _MOST_QUESTIONS = 64
+_FIGURES = ("id", "load", "area_m2", "age_s")
+_OF_CONTACT = ("frame", "cop_m", "normal", "velocity_m_s", "kind", *_FIGURES)
 
 
 class Blobs:
@@ -63,6 +67,7 @@ class _Got:
         self.change: tuple[int, int] | None = None
         self.status: dict[str, bytes] = {}
         self.contacts: tuple[tuple[object, ...], list[dict[str, Any]]] = (), []
+        self.source: tuple[Source | None, bool] = None, False  # of contacts, and whether they are on the driver
 
 
 class Viewer:
@@ -120,13 +125,13 @@ class Viewer:
     @property
     def has_news(self) -> bool:
         return (
-            self._exact_due_ns == 0
+            any(self._got[driver.number].change != _seen(driver) for driver in self.show.follower.drivers)
+            or self._exact_due_ns == 0
             or bool(self._questions)
             or self.plots.has_news
             or self._error is not None
             or self._edition != self.show.follower.edition
             or self._sent != self._of_replays()
-            or any(self._got[driver.number].change != _seen(driver) for driver in self.show.follower.drivers)
         )
 
     def turn(self, besides: dict[str, Any]) -> bytes:
@@ -243,27 +248,29 @@ class Viewer:
         return got.contacts[1]
 
     def _touched(self, driver: ShownDriver, quantity: Quantity, frame: ContactsSample | None) -> list[dict[str, Any]]:
-        if (
-            frame is None
-            or frame.source.type_name != quantity.type.name
-            or not len(found := frame.contacts)
-            or not are_on(frame, driver.structure)
-        ):
+        if frame is None or frame.source.type_name != quantity.type.name or not frame.column("count")[0]:
             return []
-        scene, contacts = self.show.follower.scene, []
-        for row in range(len(found)):
-            frame_number = int(found.frame[row])
-            pose = scene.pose(driver.name, found.frames[frame_number] if frame_number >= 0 else "")
-            place = pose @ [*found.cop_m[row].tolist(), 1.0]
-            position, normal = place[:3].tolist(), (pose[:3, :3] @ found.normal[row]).tolist()
+        got = self._got[driver.number]
+        if got.source[0] is not frame.source:
+            got.source = frame.source, are_on(frame, driver.structure)
+        if not got.source[1]:
+            return []
+        scene, source, contacts = self.show.follower.scene, frame.source, []
+        filled = slice(0, min(int(frame.column("count")[0]), MOST))
+        rows = zip(*(frame.column(name)[filled].tolist() for name in _OF_CONTACT), strict=True)
+        for row, (frame_number, cop_m, normal, velocity_m_s, kind, *figures) in enumerate(rows):
+            pose = scene.pose(driver.name, source.frames[frame_number] if frame_number >= 0 else "")
+            position = (pose @ [*cop_m, 1.0])[:3].tolist()
             if not all(map(math.isfinite, position)):  # in the middle of its taxels as they are laid out
                 laid_out = scene.of(driver.name, quantity.name).position
-                position = laid_out[found.contact_of == row].mean(axis=0, dtype=np.float64).tolist()
-            kind, speed = ContactKind(found.kind[row]).name.lower(), math.hypot(*found.velocity_m_s[row].tolist())
-            contacts.append(
-                {name: getattr(found, name)[row].item() for name in ("id", "load", "area_m2", "age_s")}
-                | {"kind": kind, "position": position, "normal": normal, "unit": frame.source.unit, "speed": speed}
-            )
+                position = laid_out[frame.column("contact_of") == row].mean(axis=0, dtype=np.float64).tolist()
+            place = {
+                "position": position,
+                "normal": (pose[:3, :3] @ normal).tolist(),
+                "speed": math.hypot(*velocity_m_s),
+            }
+            known = {"kind": ContactKind(kind).name.lower(), "unit": source.unit}
+            contacts.append(dict(zip(_FIGURES, figures, strict=True)) | known | place)
         return contacts
 
     def _exactly(self, number: int, position: int) -> dict[str, Any] | None:

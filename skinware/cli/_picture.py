@@ -18,7 +18,7 @@ from skinware.state import count_reasons, settling, status_now
 from skinware.structure import Structure
 from skinware.tactile.regions import Regions
 from skinware.text import measure_text, status_text, why_text
-from skinware.views.history import Memory
+from skinware.views.history import DriverRest, Memory
 from skinware.views.quantities import types_of
 
 Levels = npt.NDArray[np.uint8]
@@ -94,7 +94,7 @@ class Picture:
     def take_baselines(self) -> None:
         """Take the next values for rest."""
         for memory in self._memories.values():
-            memory.rest.begin()
+            memory.rest = DriverRest(memory.structure)
         self._levels = None
 
     def draw(self, key: RowKey, frame: DriverSnapshot, width: int, height: int, life: str) -> None:

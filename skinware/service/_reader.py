@@ -307,15 +307,10 @@ def samples_after(
         in_place: do not copy them; ask ``valid`` of each after using it.
     """
     ring = reader._ring  # noqa: SLF001
-    take, first, latest = ring.view if in_place else ring.copy, 1, ring.latest
-    if position is None:
-        first = max(first, latest)
-    elif position[0] == ring.generation:
-        first = position[1] + 1
-    for sequence in range(max(first, latest - ring.slot_count + 2), latest + 1):
-        sample = take(sequence)
-        if sample is not None:
-            yield sample
+    generation, known = position or (ring.generation, ring.latest - 1)
+    first, latest = known + 1 if generation == ring.generation else 1, ring.latest
+    sequences = range(max(1, first, latest - ring.slot_count + 2), latest + 1)
+    yield from filter(None, map(ring.view if in_place else ring.copy, sequences))
 
 
 class Tap(ServiceReader[SampleT]):

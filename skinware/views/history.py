@@ -52,11 +52,7 @@ class DriverRest:
         self._structure = structure
         growing = [t.id for t in structure.types if t.name in _GROW_WHEN_TOUCHED]
         self._grows: npt.NDArray[np.bool_] = np.isin(structure.sensor_type, growing)
-        self.begin()
-
-    def begin(self) -> None:
-        """Forget everything; the next values are the baseline."""
-        n = self._structure.n_sensors
+        n = structure.n_sensors
         self.baseline: Floats = np.full(n, np.nan, np.float32)
         self._age_s = np.zeros(n, np.float32)
         self._unrest = np.zeros(n, np.float32)

@@ -38,10 +38,7 @@ _LONGEST_S = 0.2
 """Between two looks while no viewer waits: the next one looks by itself when it asks."""
 _LONGEST_TURN_S = 0.5
 _PLOTS_EVERY_S = 0.09
-"""Between two draws of its plots by the page: samples for them are taken as rarely, unless their ring is too short.
-
-What is no picture is followed then, too.
-"""
+"""Between two draws of plots by the page: what is no picture is followed as rarely, unless a ring is too short."""
 _EARLY_S = 0.005
 """A turn may be sent this much earlier than the pace asks for."""
 _MOST_VIEWERS = 32

@@ -160,20 +160,12 @@ class Viewer:
             header["exact"] = [exact for number, at in self._exact if (exact := self._exactly(number, at)) is not None]
         if self._questions:
             header |= self._answer(self._questions.pop(0))
-        blocks = self.plots.blocks()
+        blocks = [
+            block._asdict() | {"time_ns": blobs.add(block.time_ns, "<i8"), "values": blobs.add(block.values, "<f8")}
+            for block in self.plots.blocks()
+        ]
         if blocks:
-            told = [
-                {
-                    "number": block.number,
-                    "of": block.of,
-                    "begins": block.begins,
-                    "lines": block.lines,
-                    "time_ns": blobs.add(block.time_ns, "<i8"),
-                    "values": blobs.add(block.values, "<f8"),
-                }
-                for block in blocks
-            ]
-            header["plots"] = {"missed": self.plots.missed, "blocks": told}
+            header["plots"] = {"missed": self.plots.missed, "blocks": blocks}
         if self._error is not None:
             header["error"], self._error = self._error, None
         replays = self._of_replays()

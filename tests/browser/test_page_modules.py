@@ -49,9 +49,6 @@ def tell(page: Page) -> Callable[..., Any]:
     return tell
 
 
-# -- names.js ------------------------------------------------------------------------------------------------------
-
-
 HAND = """(() => {
     const names = ["index tip", "index pad", "thumb tip", "thumb pad", "palm"];
     const at = [[0, 5], [0, 3], [3, 5], [3, 3], [1.5, 0]];
@@ -88,9 +85,6 @@ def test_parts_of_a_hand_have_names_and_totals_where_there_is_room(tell: Callabl
     assert tell("names.js", HAND, 1, None, 9, -500) == []  # beside the picture
 
 
-# -- turn.js -------------------------------------------------------------------------------------------------------
-
-
 TURN = """(() => {
     const text = new TextEncoder().encode(a[0]);
     const bytes = new Uint8Array(a[1] + 24);
@@ -107,9 +101,6 @@ TURN = """(() => {
 def test_a_turn_is_taken_apart(tell: Callable[..., Any]) -> None:
     for size in (24, 32):
         assert tell("turn.js", TURN, '{"turn": 3}', size) == [3, [0, 0, 7], [2.5]]
-
-
-# -- marks.js ------------------------------------------------------------------------------------------------------
 
 
 def test_every_status_has_the_mark_that_says_most(tell: Callable[..., Any]) -> None:
@@ -157,9 +148,6 @@ def test_marks_of_taxels(
     assert tell("marks.js", FILL, dimmed, is_old, is_wipe) == [True, False, marks]
 
 
-# -- palette.js ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_each_level_is_farther_from_the_ground_in_grey(tell: Callable[..., Any], theme: str) -> None:
     """Told apart by brightness alone, by whoever sees few colours."""
@@ -194,9 +182,6 @@ def test_the_past_is_kept_for_a_time_and_in_bounded_memory(tell: Callable[..., A
     assert kept <= 10_500
     assert oldest == 90_000
     assert rest == [90, 95, 99, 2, 0, None]
-
-
-# -- address.js ----------------------------------------------------------------------------------------------------
 
 
 def test_an_address_tells_the_view(tell: Callable[..., Any]) -> None:
@@ -237,9 +222,6 @@ def test_a_bad_address_is_no_view(tell: Callable[..., Any], text: str) -> None:
     assert [found["pins"], found["plots"], found["times"]] == [[], [], None]
 
 
-# -- curves.js, series.js, spectrum.js, format.js ------------------------------------------------------------------
-
-
 def test_a_line_shows_the_extremes_of_each_column(tell: Callable[..., Any]) -> None:
     """One sample among a thousand is not lost; what is not in the window is left out; a gap stays one."""
     window = "{from: 10, to: 20, width: 100}"
@@ -260,11 +242,9 @@ def test_a_line_shows_the_extremes_of_each_column(tell: Callable[..., Any]) -> N
 
 
 def test_the_noise_of_a_line_has_no_slope_and_no_gaps(tell: Callable[..., Any]) -> None:
-    noise = "m.noiseOf(Float64Array.from(a[0], x => x ?? NaN))"
-    assert tell("curves.js", noise, list(range(9))) == 0
-    assert tell("curves.js", noise, [0, 1] * 500) == pytest.approx(1 / np.sqrt(2), rel=0.01)
-    assert tell("curves.js", noise, [0, 1, None, 2]) is None
-    assert tell("curves.js", noise, []) is None
+    series = [[*range(9)], [0, 1] * 500, [0, 1, None, 2], []]
+    noises = tell("curves.js", "a[0].map((values) => m.noiseOf(Float64Array.from(values, x => x ?? NaN)))", series)
+    assert noises == [0, pytest.approx(1 / np.sqrt(2), rel=0.01), None, None]
 
 
 def test_ticks_are_round(tell: Callable[..., Any]) -> None:
@@ -367,9 +347,6 @@ def test_what_has_a_problem_is_first_in_the_tree(tell: Callable[..., Any]) -> No
         ["d0", 0, [["d0/x", 0, [["d0/x/p0", 0, []]]], ["d0/y", 0, []]]]
     ]
     assert tell("tree.js", "[m.OLD, m.GONE]") == [OLD, GONE]
-
-
-# -- framing.js ----------------------------------------------------------------------------------------------------
 
 
 PICTURE = "{ right: 0.4, left: 0.4, top: 0.3, bottom: 0.25 }"

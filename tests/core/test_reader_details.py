@@ -118,34 +118,18 @@ def test_turns_of_a_loop_are_taken_in_c_and_counted() -> None:
 
 @pytest.mark.parametrize("in_place", [False, True])
 def test_samples_after_a_position_are_those_that_the_ring_has(in_place: bool) -> None:
-    def found(position: tuple[int, int] | None) -> list[int]:
-        samples = list(samples_after(reader, position, in_place=in_place))
-        assert all(sample.valid for sample in samples)
-        assert [int(sample.column("values")[0]) for sample in samples] == [sample.sequence for sample in samples]
-        return [sample.sequence for sample in samples]
-
     with ServiceWriter("x", SMALL, slots=8) as writer, ServiceReader[Sample]("x") as reader:
-        assert found(None) == found((reader.generation, 0)) == []
-        for sequence in range(1, 6):
-            publish(writer, sequence)
-        assert found(None) == [5]
-        assert found((reader.generation, 2)) == [3, 4, 5]
-        assert found((reader.generation, 5)) == found((reader.generation, 99)) == []
-        assert found((reader.generation - 1, 3)) == [1, 2, 3, 4, 5]  # another generation
-        for sequence in range(6, 21):
-            publish(writer, sequence)
-        assert found((reader.generation, 2)) == list(range(14, 21))  # the others were overwritten
-
-
-def test_a_sample_in_place_is_not_valid_once_it_is_overwritten() -> None:
-    with ServiceWriter("x", SMALL, slots=8) as writer, ServiceReader[Sample]("x") as reader:
-        publish(writer, 1)
-        (sample,) = samples_after(reader, None, in_place=True)
-        for value in range(2, 9):
-            publish(writer, value)
-            assert (sample.valid, int(sample.column("values")[0])) == (True, 1)
-        publish(writer, 9)
-        assert (sample.valid, int(sample.column("values")[0])) == (False, 9)
+        taken: list[Sample] = []
+        for last, known, expected in [(0, 0, []), (5, 2, [3, 4, 5]), (5, 9, []), (20, 2, [*range(14, 21)])]:
+            for value in range(writer.sequence + 1, last + 1):
+                publish(writer, value)
+            taken = list(samples_after(reader, (reader.generation, known), in_place=in_place))
+            assert [int(sample.column("values")[0]) for sample in taken] == expected
+            newest = samples_after(reader, None, in_place=in_place)
+            assert [sample.sequence for sample in newest] == [last] * (last > 0)
+        publish(writer, 21)
+        publish(writer, 22)
+        assert [sample.valid for sample in taken] == [not in_place] + [True] * 6
 
 
 def test_a_tap_says_that_it_reads_in_order_and_reports_what_c_took() -> None:

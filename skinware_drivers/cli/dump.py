@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import time
 from collections.abc import Iterator
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from skinware_drivers.bus import Bus, FrameBatch
 
 _LOOK_EVERY_S = 0.1
+_SILENCE_S = 1.0
+"""A driver that publishes nothing for so long, or for three periods, is silent."""
 _CALMED = ("uncertainty", "why")
 """Columns of drivers that skin-calm publishes."""
 _CAN_PAYLOAD, _CLASSIC_PAYLOAD = 64, 8
@@ -180,19 +183,33 @@ def _only_driver(namespace: Namespace, end_s: float) -> str:
 
 
 def _frames(reader: DriverReader, rate_hz: float | None, timeout_s: float | None) -> Iterator[DriverSnapshot]:
-    """Yield snapshots without end, also after restarts of the driver, which are reported on stderr."""
-    from skinware.errors import StructureChanged
+    """Yield snapshots without end, also after silences and restarts of the driver, which are reported on stderr."""
+    from skinware.errors import ServiceTimeout, StructureChanged
+    from skinware.realtime import Periodic
     from skinware.text import plural
 
-    generation = reader.generation
+    generation, is_silent = reader.generation, not reader.alive  # which was reported
+    timer = None if rate_hz is None else Periodic(rate_hz)
+    silence_s = max(_SILENCE_S, 3 / (reader.rate_hz() or math.inf))
     while True:
+        warns = not is_silent and (timeout_s is None or timeout_s > silence_s)
+        frames = (reader.in_order if timer is None else reader.samples)(timeout_s=silence_s if warns else timeout_s)
         try:
-            frames = reader.in_order(timeout_s=timeout_s) if rate_hz is None else _sampled(reader, rate_hz, timeout_s)
             for frame in frames:
                 if frame.generation != generation:
                     generation = frame.generation
                     cli.warn(f"driver {reader.name!r} was started again")
                 yield frame
+                if timer is not None:
+                    timer.wait()
+                if is_silent:
+                    is_silent = False
+                    break
+        except ServiceTimeout as silence:
+            if not warns:
+                raise
+            cli.warn(str(silence))
+            is_silent = True
         except StructureChanged:
             _reattach(reader, timeout_s)
             generation = reader.generation
@@ -212,17 +229,6 @@ def _reattach(reader: DriverReader, timeout_s: float | None) -> None:
             if end_s is not None and time.monotonic() >= end_s:
                 raise
         time.sleep(_LOOK_EVERY_S)
-
-
-def _sampled(reader: DriverReader, rate_hz: float, timeout_s: float | None) -> Iterator[DriverSnapshot]:
-    from skinware.realtime import Periodic
-
-    timer = Periodic(rate_hz)
-    newest: DriverSnapshot | None = None
-    while True:
-        newest = reader.read(newer_than=newest, timeout_s=timeout_s)
-        yield newest
-        timer.wait()
 
 
 def dump_bus(bus_name: str, count: int | None, timeout_s: float | None, as_json: bool) -> None:

@@ -7,7 +7,6 @@ import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import closing
-from itertools import islice
 from typing import Any
 
 import click
@@ -15,8 +14,8 @@ import numpy as np
 import pytest
 
 from skinware import DriverReader, Namespace, ServiceWriter, Status
-from skinware.cli._command import exit_status
-from skinware.errors import ServiceNotFound, ServiceTimeout
+from skinware.cli._command import exit_status, warn
+from skinware.errors import ServiceNotFound
 from skinware_drivers.cli.dump import _attach, _frames, _reattach, as_line, command
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill, publishing
 from tests.commands import BIN, PATIENCE_S
@@ -236,14 +235,26 @@ def test_a_driver_that_changed_and_went_again_is_waited_for(monkeypatch: pytest.
             _reattach(reader, 0.01)
 
 
+@pytest.mark.parametrize("limits", [(None, None), (1000.0, None), (None, 60.0)])
 @pytest.mark.usefixtures("context")
-def test_frames_end_with_the_timeout() -> None:
-    with FakeSkin("a") as skin, DriverReader("a") as reader:
-        skin.publish(2)
-        frames = _frames(reader, None, 0.01)
-        assert len(list(islice(frames, 1))) == 1
-        with pytest.raises(ServiceTimeout):
-            next(frames)
+def test_a_silence_is_reported_once_and_its_end_followed(
+    limits: tuple[float | None, float | None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skinware_drivers.cli.dump._SILENCE_S", 0.01)
+    with FakeSkin("a", fake_structure(1, 2)) as skin, closing(_attach(Namespace(), "a", None)) as reader:
+        skin.publish()
+        frames = _frames(reader, *limits)
+        assert next(frames).sequence == 1
+
+        def end_it(text: str) -> None:
+            warn(text)
+            skin.publish()
+
+        with monkeypatch.context() as patched:
+            patched.setattr("skinware_drivers.cli.dump.cli.warn", end_it)
+            for sequence in (2, 3):
+                assert next(frames).sequence == sequence
+                assert re.fullmatch("skin-dump: no newer sample of 'a': .* is silent .*\n", capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("form", ["--json", pytest.param("--counts", marks=pytest.mark.thorough)])

@@ -159,7 +159,7 @@ def command(
     So is the geometry file.
     Closing the terminal also sends SIGHUP; the driver then ends.
 
-    Exit status: 0 interrupted, 1 failed, 2 wrong usage or configuration.
+    Exit status: 0 interrupted, 1 it failed or its capture ended early, 2 wrong usage or configuration.
     """
     from skinware_drivers.cli.driver_setup import DriverConfig, DriverSetup
     from skinware_drivers.running.generation import FlowLoop
@@ -172,16 +172,19 @@ def command(
         on_ready=lambda: print_ready(runner, as_json),
         on_patches=lambda change: print_patches(runner, change) if as_json else None,
     )
+    recorder: Capture | None = None
     with contextlib.ExitStack() as beside:
         if capture is not None:
             from skinware_drivers.cli.capturing import captured
 
             done = partial(print_capture, as_json=as_json)
-            beside.enter_context(captured(capture, setup.name, setup.namespace.name, done))
+            recorder = beside.enter_context(captured(capture, setup.name, setup.namespace.name, done))
         if setup.profile is not None:  # not for the recorder
             setup.profile.apply()
         with asyncio.Runner(loop_factory=FlowLoop) as loop:
             loop.run(_run(runner, as_json, partial(setup.read_again, runner)))
+    if recorder is not None and recorder.result["problem"]:
+        click.get_current_context().exit(cli.EXIT_FAILED)
 
 
 async def _run(runner: Runner, as_json: bool, read_files: Callable[[], Coroutine[Any, Any, None]]) -> None:

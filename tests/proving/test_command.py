@@ -20,7 +20,7 @@ import pytest
 import skinware.recording
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
-from tests.commands import BIN, refused, run
+from tests.commands import BIN, children_of, is_there, refused, run
 from tests.proving.rig import EmulatedHand, PressingPerson, hand, straight
 
 STRUCTURE = fake_structure(1, 2)
@@ -85,21 +85,6 @@ def test_it_starts_a_driver_and_captures_its_first_byte(tmp_path: Path) -> None:
         (wire,) = recording.wires
         assert next(wire.items()).is_sent
         assert recording.about("weiss_wts")["driver_type"] == "weiss_wts"
-
-
-def children_of(pid: int) -> set[int]:
-    """Processes that a process has started, and theirs."""
-    found: set[int] = set()
-    for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in map(int, task.read_text().split()):
-            found |= {child, *children_of(child)}
-    return found
-
-
-def is_there(pid: int) -> bool:
-    with contextlib.suppress(OSError):
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return False
 
 
 @pytest.mark.thorough

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import shutil
 import signal
 import socket
@@ -17,7 +18,7 @@ from skinware import DriverReader, Namespace
 from skinware.recording import Recording, WireItem
 from skinware_drivers.doctor.report import Disguise, Secrets
 from skinware_drivers.testing.waiting import wait_until
-from tests.commands import refused, run, running
+from tests.commands import children_of, is_there, refused, run, running
 from tests.streams.peers import LOCAL, free_port
 
 ARRAY = str(Path(__file__).parents[1] / "modbus" / "array_file.py")
@@ -168,6 +169,20 @@ def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
     assert refused.returncode == 2
     assert refused.stderr == f"skin-driver: {path}: exists already: give another name, or remove it\n"
     assert path.read_text() == "mine"
+
+
+def test_a_driver_whose_capture_ended_early_has_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # or the limit cuts off the bytecode of what is imported
+    path = tmp_path / "hand.mcap"
+    with running("skin-driver", "--driver", "xela", "--bus", "virtual", "--capture", str(path), "--json") as driver:
+        driver.wait_for("ready")
+        (recorder,) = children_of(driver.process.pid)
+        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (1, 1))  # as a full disk
+        wait_until(lambda: not is_there(recorder))
+        sequence = driver.wait_for("status")["sequence"]
+        assert driver.wait_for("status")["sequence"] > sequence
+        last = driver.stop()
+    assert (driver.process.returncode, last["event"], last["problem"]) == (1, "captured", "File too large")
 
 
 @pytest.mark.parametrize(

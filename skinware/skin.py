@@ -10,7 +10,7 @@ from typing import Self
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.drivers import Drivers
-from skinware.errors import Closed, ConfigurationError, Overrun, ServiceNotFound, ServiceTimeout
+from skinware.errors import Closed, ConfigurationError, NamespaceError, Overrun, ServiceNotFound, ServiceTimeout
 from skinware.geometry import Geometry
 from skinware.memory import futex
 from skinware.memory.namespace import Namespace
@@ -98,6 +98,8 @@ class Skin:
             NamespaceError: the namespace cannot be trusted or read.
         """
         self._discover(at_once=True)
+        if self._drivers.trouble:
+            raise NamespaceError(self._drivers.trouble)
         return self._layout
 
     def geometry(self, type_name: str) -> Geometry:

@@ -76,14 +76,15 @@ class Namespace:
             for path, mode in ((self.path, 0o2750), (self.readers_path, 0o3770)):
                 if not path.is_symlink() and not path.exists():
                     _make_folder(path, mode, group_id)
+                owner = self.path.lstat().st_uid
+                if owner != os.geteuid():
+                    raise NamespaceError(
+                        f"namespace {self.name!r} ({self.path}) belongs to {_user_name(owner)}: drivers must run as"
+                        " that user, or in another namespace (SKINWARE_NAMESPACE)"
+                    )
         except OSError as error:
             raise NamespaceError(f"cannot make {error.filename or self.path}: {error.strerror}") from None
-        owner = self.check()
-        if owner != os.geteuid():
-            raise NamespaceError(
-                f"namespace {self.name!r} ({self.path}) belongs to {_user_name(owner)}: drivers must run as that"
-                " user, or in another namespace (SKINWARE_NAMESPACE)"
-            )
+        self.check()
         present = self.path.stat().st_gid
         if group is not None and present != group_id:
             raise ConfigurationError(
@@ -138,10 +139,12 @@ class Namespace:
         except FileNotFoundError:
             return {}
         except PermissionError:
+            folder = self.path.stat()
+            ask = f"ask {_user_name(folder.st_uid)} to add you to {_group_name(folder.st_gid)}"
             raise NamespaceError(
-                f"{self.path} may not be read by {_user_name(os.geteuid())}; ask its owner"
-                f" {_user_name(self.path.stat().st_uid)} to add you to its group, or use another namespace"
-                " (--namespace, SKINWARE_NAMESPACE)"
+                f"{self.path} may not be read by {_user_name(os.geteuid())};"
+                f" {ask if folder.st_gid else 'start its drivers with --group and a group of yours'}, or use another"
+                " namespace (--namespace, SKINWARE_NAMESPACE)"
             ) from None
         except OSError as error:  # no descriptors left
             raise NamespaceError(f"{self.path} cannot be read: {error.strerror}") from None

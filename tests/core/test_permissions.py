@@ -13,18 +13,12 @@ from collections.abc import Callable
 
 import pytest
 
-from skinware import Namespace, Sample, ServiceReader, ServiceWriter
-from skinware.errors import SkinwareError
+from skinware import Namespace, Sample, ServiceReader, ServiceWriter, Skin
+from skinware.errors import NamespaceError, SkinwareError
 from skinware.memory.announcement import living_readers
 from skinware.memory.locks import _FLOCK
 from skinware_drivers.testing.waiting import wait_until
-from tests.core.users import (
-    COLUMNS,
-    FRAMES,
-    MEMBER,
-    STRANGER,
-    Users,
-)
+from tests.core.users import COLUMNS, FRAMES, GROUP, MEMBER, OWNER, STRANGER, Users
 from tests.core.workers import PATIENCE_S
 
 pytestmark = [
@@ -126,6 +120,31 @@ def test_a_member_of_the_group_can_change_nothing(users: Users) -> None:
     assert len(found) > 30
     before = int(users.board.rows[0, FRAMES])
     wait_until(lambda: users.board.rows[0, FRAMES] > before + 5, PATIENCE_S)
+
+
+def reasons() -> list[str]:
+    """Why a stranger may neither read nor write."""
+    with pytest.raises(NamespaceError) as reading:
+        Namespace().services()
+    with pytest.raises(NamespaceError) as writing:
+        ServiceWriter("x", COLUMNS)
+    return [str(reading.value), str(writing.value)]
+
+
+def test_a_stranger_reads_whom_to_ask(users: Users) -> None:
+    folder = Namespace().path
+    for advice in (f"ask user {OWNER} to add you to group {GROUP}", "start its drivers with --group and a group"):
+        reading, writing = users.ask(STRANGER, reasons)
+        assert reading.startswith(f"{folder} may not be read by user {STRANGER}; {advice}")
+        assert f"belongs to user {OWNER}: drivers must run as that user" in writing
+        os.chown(folder, -1, 0)  # as a driver of root makes it
+
+
+@pytest.mark.usefixtures("users")
+def test_what_may_not_be_trusted_is_not_empty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SKINWARE_OWNER", raising=False)
+    with Skin() as skin, pytest.raises(NamespaceError, match=f"belongs to user {OWNER}, who is neither you nor root"):
+        skin.refresh()
 
 
 def strange() -> dict[str, str]:

@@ -242,25 +242,20 @@ def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     """
     for number in ending_signals()[1:]:
         signal.signal(number, signal.default_int_handler)
-    _keep_interrupts()
+    sys.unraisablehook = _interrupt_again
     with patient_output() if goes_on else contextlib.nullcontext():
         status = exit_status(command, sys.argv[1:])
     sys.exit(status)
 
 
-def _keep_interrupts() -> None:
+def _interrupt_again(dropped: sys.UnraisableHookArgs) -> None:
     """Repeat an interrupt that came in a destructor or a callback: Python drops the exceptions of these."""
-    report = sys.unraisablehook
-
-    def look(dropped: sys.UnraisableHookArgs) -> None:
-        if not issubclass(dropped.exc_type, KeyboardInterrupt):
-            report(dropped)
-            return
-        again = threading.Timer(0.05, signal.pthread_kill, (threading.main_thread().ident, signal.SIGTERM))
-        again.daemon = True
-        again.start()
-
-    sys.unraisablehook = look
+    if not issubclass(dropped.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(dropped)
+        return
+    again = threading.Timer(0.05, signal.pthread_kill, (threading.main_thread().ident, signal.SIGTERM))
+    again.daemon = True
+    again.start()
 
 
 def exit_status(command: click.Command, arguments: Sequence[str]) -> int:

@@ -152,6 +152,8 @@ def _without_driver(
 
     declared = operations_of(type(adapter), alone=True)
     if operation is None:
+        if bus_name in declared:
+            raise click.UsageError(f"{bus_name} is an operation: name the driver or the bus before it")
         return {"operations": {name: _description(one.method) for name, one in declared.items()}}
 
     def agree(patches: Sequence[Patch]) -> None:

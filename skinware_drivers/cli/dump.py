@@ -139,10 +139,8 @@ def as_line(frame: DriverSnapshot, type_name: str | None, counts: bool) -> str:
             values = all_values[index][fresh]
             figures, mean = NO_VALUE, ""
             if len(values):
-                figures, mean = (
-                    f"{figure_text(float(values.min()), 5)} to {figure_text(float(values.max()), 5)}",
-                    f" (mean {figure_text(float(values.mean()), 5)})",
-                )
+                least, most, middle = (figure_text(float(of(values)), 5) for of in (np.min, np.max, np.mean))
+                figures, mean = f"{least} to {most}", f" (mean {middle})"
             parts.append(f"{sensor_type.name} {figures} {'raw' if counts else sensor_type.unit}{mean}")
     return "  ".join([*parts, f"{not_fresh} not fresh"])
 

@@ -144,6 +144,7 @@ def test_a_driver_that_starts_while_a_person_thinks_is_noticed(
     [
         ([], 2, "NAME_OR_BUS"),
         ([VIRTUAL, "nonsense"], 2, "no operation 'nonsense'"),
+        (["rebaseline"], 2, "rebaseline is an operation: name the driver or the bus before it"),
         ([VIRTUAL, "rate", "50"], 2, "KEY=VALUE"),
         ([VIRTUAL, "rate", "hz=50", "pace=3", "--yes"], 2, "it takes: bus, patch, hz"),
         ([VIRTUAL, "rate", "hz=0", "--yes"], 2, "3.93 to 1000 Hz"),

@@ -123,7 +123,6 @@ def test_a_member_of_the_group_can_change_nothing(users: Users) -> None:
 
 
 def reasons() -> list[str]:
-    """Why a stranger may neither read nor write."""
     with pytest.raises(NamespaceError) as reading:
         Namespace().services()
     with pytest.raises(NamespaceError) as writing:

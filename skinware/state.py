@@ -182,7 +182,7 @@ def report_of(
     report = DriverReport(reader.name, life, rate_hz, frame.age_ns, structure.n_sensors, statuses)
     if structure is not reader.structure and structure != reader.structure:
         return report
-    of_buses = (frame.bus_state.tolist(), frame.bus_reason.tolist(), frame.bus_load.tolist())
+    columns = (frame.bus_state.tolist(), frame.bus_reason.tolist(), frame.bus_load.tolist(), reader.bus_counters(frame))
     buses = tuple(
         BusReport(
             name,
@@ -191,9 +191,7 @@ def report_of(
             None if load in (LOAD_UNKNOWN, LOAD_FILTERED) else load / 1000,
             counters,
         )
-        for name, state, reason, load, counters in zip(
-            structure.buses, *of_buses, reader.bus_counters(frame), strict=True
-        )
+        for name, state, reason, load, counters in zip(structure.buses, *columns, strict=True)
     )
     sensors, fresh, dark, waiting = (
         np.bincount(patches, minlength=structure.n_patches).tolist()

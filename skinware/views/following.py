@@ -32,7 +32,6 @@ _CALM_WITHIN_NS = 20_000_000
 """A calmed snapshot follows the snapshot that it was made of within this time, or not at all."""
 _EARLY_NS = 5_000_000
 """A snapshot may be taken this much earlier than the pace asks for."""
-_UNHEALTHY = np.uint8(Status.UNHEALTHY)
 
 
 class Origin:
@@ -219,7 +218,7 @@ class ShownDriver:
         ):
             calm = None  # it has other sensors
         if calm is not None:
-            status = status | (calm.status & _UNHEALTHY)
+            status = status | (calm.status & np.uint8(Status.UNHEALTHY))
         live, last = self.origin.calmed(self.live.name) if calm is not None else self.live, calm or frame
         before = (self.newest.calm or self.newest.frame).position if self.newest is not None else None
         read_all = partial(live.until, last, before) if is_newer and live is not None else lambda: [last]

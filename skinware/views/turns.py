@@ -37,8 +37,7 @@ _STATE_EVERY_NS = NS_PER_S
 _EXACT_EVERY_NS = NS_PER_S // 4
 """People read no more numbers."""
 _MOST_QUESTIONS = 64
-_FIGURES = ("id", "load", "area_m2", "age_s")
-_OF_CONTACT = ("frame", "cop_m", "normal", "velocity_m_s", "kind", *_FIGURES)
+_OF_CONTACT = ("frame", "cop_m", "normal", "velocity_m_s", "kind", "id", "load", "area_m2", "age_s")
 
 
 class Blobs:
@@ -262,7 +261,7 @@ class Viewer:
                 "speed": math.hypot(*velocity_m_s),
             }
             known = {"kind": ContactKind(kind).name.lower(), "unit": source.unit}
-            contacts.append(dict(zip(_FIGURES, figures, strict=True)) | known | place)
+            contacts.append(dict(zip(_OF_CONTACT[5:], figures, strict=True)) | known | place)
         return contacts
 
     def _exactly(self, number: int, position: int) -> dict[str, Any] | None:

@@ -235,8 +235,8 @@ def test_figures_of_contacts_and_regions_do_not_wrap(page: Page, server: FakeSer
         for name in ("palm", "the whole of the left forearm")
     ]
     until(page, "skin.contacts.length === 2")
-    until(page, "document.querySelector('#contacts').innerText.includes('12346 counts')")
-    assert "12346\t" in page.locator("#regions").inner_text()
+    until(page, "document.querySelector('#contacts').innerText.includes('12,346 counts')")
+    assert "12,346\t" in page.locator("#regions").inner_text()
     assert "counts" in page.locator("#regions thead").inner_text()
     until(page, "document.querySelectorAll('#contacts tbody tr').length === 2")
     heights = tell(page, "[...document.querySelectorAll('#contacts tbody td, th')].map(cell => cell.clientHeight)")

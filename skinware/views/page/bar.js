@@ -1,8 +1,8 @@
 // The line of figures: of each driver its rate, age, losses and load; how fast this page draws.
 
 import { h, setChildren, setText } from "./dom.js";
-import { age, count, percent, rate } from "./format.js";
-import { OLD } from "./tree.js";
+import { count, percent } from "./format.js";
+import { figuresOf, OLD } from "./tree.js";
 
 export class Bar {
   #chips = new Map();
@@ -24,7 +24,7 @@ export class Bar {
       setText(chip.firstChild, driver.name);
       const state = driver.isCut ? "no connection" : bad ? figures.shown : null;
       const fresh = figures.fresh === undefined ? null : `${count(figures.fresh)}/${count(figures.sensors)} fresh`;
-      const parts = [state, rate(figures.rate_hz), age(figures.age_ms), fresh, `dropped ${count(figures.dropped)}`];
+      const parts = [state, ...figuresOf({ report: figures }), fresh, `dropped ${count(figures.dropped)}`];
       if (figures.load !== undefined && figures.load !== null) parts.push(`load ${percent(figures.load)}`);
       setText(chip.lastChild, parts.filter(Boolean).join(" · "));
     }

@@ -28,17 +28,17 @@ export function percent(part) {
   return isKnown(part) ? `${(100 * part).toFixed(0)} %` : NONE;
 }
 
-/** A number with about four digits. */
+/** A number with about four digits, large ones whole: "0.012", "150", "20,000". */
 export function figure(x) {
   if (!isKnown(x)) return NONE;
   if (x !== 0 && (Math.abs(x) >= 1e8 || Math.abs(x) < 1e-3)) return x.toExponential(2);
-  return String(Number(x.toPrecision(4)));
+  return Math.abs(x) >= 1e4 ? count(Math.round(x)) : String(Number(x.toPrecision(4)));
 }
 
 /** A number with about three digits, where there is little room. */
 export function short(x) {
   if (!isKnown(x)) return NONE;
-  return Math.abs(x) >= 100 ? x.toFixed(0) : String(Number(x.toPrecision(3)));
+  return Math.abs(x) >= 100 ? figure(Math.round(x)) : String(Number(x.toPrecision(3)));
 }
 
 const PREFIXES = [[1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "u"]];

@@ -68,7 +68,7 @@ export class Legend {
     const [factor, own] = isTyped ? [this.factor, byId("unit").textContent] : prefixed(unit, Math.max(...(ends ?? [0]).map(Math.abs)));
     this.factor = factor;
     for (const [input, end] of [[this.low, ends?.[0]], [this.high, ends?.[1]]]) {
-      if (document.activeElement !== input) input.value = ends ? figure(end / factor) : "";
+      if (document.activeElement !== input) input.value = ends ? figure(end / factor).replaceAll(",", "") : "";
     }
     const words = ends ? `colours from ${range(...ends, unit).join(" to ")}` : "colours, see the scales of the drivers";
     byId("gradient").setAttribute("aria-label", words);

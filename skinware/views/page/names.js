@@ -5,11 +5,12 @@ import { measure } from "./format.js";
 
 export const FONT = "600 11px system-ui, sans-serif";
 const LINE = 14; // pixels
-const [FADED, WHOLE] = [0.8, 1.3]; // size of a part, in widths of its name, at which that is not seen yet, and is seen whole
+const [FADED, WHOLE] = [0.8, 1.3]; // size of a part, in widths of its name, from which that is seen, and is seen whole
+const FAINTEST = 0.45; // of a name: one that cannot be read only covers taxels
 const NUMBERED = 3; // times that size for one of many, "triangle 4", whose neighbours its name would cover
 const LINES = [0, 1, 2, 3, 4, -1, -2]; // that a name may stand higher to be free, or lower
 const LEAST_SHARE = 0.01; // of the scale, from which a load is in its name
-const CORNERS = Array.from({ length: 8 }, (_, k) => [k & 1, (k >> 1) & 1, k >> 2]);
+const DIRECTIONS = [-1, 0, 1].flatMap((x) => [-1, 0, 1].flatMap((y) => [-1, 0, 1].map((z) => [x, y, z])));
 const ruler = document.createElement("canvas").getContext("2d");
 const widths = new Map();
 
@@ -30,6 +31,12 @@ class Part {
     }
     this.middle = this.low.map((low, c) => (low + this.high[c]) / 2);
     this.diameter = Math.hypot(...this.low.map((low, c) => this.high[c] - low));
+    const { position } = sheet;
+    const outermost = ([x, y, z]) => {
+      const far = (i) => x * position[3 * i] + y * position[3 * i + 1] + z * position[3 * i + 2];
+      return taxels.reduce((best, i) => (far(i) > far(best) ? i : best));
+    };
+    this.outline = [...new Set(DIRECTIONS.map(outermost))];
   }
 
   /** Sum or highest of its loads; null where they are not known. */
@@ -98,12 +105,15 @@ export class Names {
       const pixels = depth > 0 ? (part.diameter * stage.pixels) / depth : 0;
       const times = isNumbered(part.name) && !part.size ? NUMBERED : 1;
       if (pixels <= FADED * times * widthOf(part.name) || part.isAway(eye)) continue; // most, where there are many
-      const seen = CORNERS.map((corner) => stage.project(...corner.map((k, c) => (k ? part.high : part.low)[c])));
+      const { sheet, outline } = part;
+      const seen = outline.map((i) => stage.project(...sheet.position.slice(3 * i, 3 * i + 3)));
       const [xs, ys] = [0, 1].map((c) => seen.map((at) => at[c]));
+      const radius = (sheet.radius[outline[0]] * stage.pixels) / depth;
       if (isBeside(xs, stage.width) || isBeside(ys, stage.height)) continue;
-      const middle = xs.reduce((sum, x) => sum + x, 0) / 8;
-      const top = Math.max(Math.min(...ys) - LINE / 2, LINE / 2 + 2);
-      const alpha = Math.min(1, (pixels / (times * widthOf(part.name)) - FADED) / (WHOLE - FADED));
+      const middle = (Math.min(...xs) + Math.max(...xs)) / 2;
+      const top = Math.max(Math.min(...ys) - radius - LINE / 2, LINE / 2 + 2);
+      const share = (pixels / (times * widthOf(part.name)) - FADED) / (WHOLE - FADED);
+      const alpha = Math.min(1, FAINTEST + (1 - FAINTEST) * share);
       const isSeen = part.load > LEAST_SHARE * (part.sheet.shown.scale[1] - part.sheet.shown.scale[0]);
       const whole = isSeen && (part.size || alpha === 1) ? [`${part.name}  ${measure(part.load, part.sheet.unit)}`] : [];
       const lines = part.size ? LINES : [0];

@@ -169,7 +169,7 @@ function isFresh({ level, bad, report, children }) {
 }
 
 /** Texts of a row's figures; always as many for a row of a level. */
-function figuresOf({ level, report }) {
+export function figuresOf({ level, report }) {
   if (level === 2) return [isKnown(report.load) ? percent(report.load) : ""];
   return [isKnown(report.rate_hz) ? rate(report.rate_hz) : "", isKnown(report.age_ms) ? age(report.age_ms) : ""];
 }

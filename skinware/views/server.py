@@ -210,8 +210,8 @@ class ViewServer:
             del self._viewers[viewer]
             if show is self._live:
                 viewer.plots.close()
-            else:
-                await asyncio.shield(asyncio.to_thread(_close, viewer))
+            else:  # files may wait for what is being read
+                await asyncio.shield(asyncio.gather(*map(asyncio.to_thread, (viewer.plots.close, show.close))))
 
     async def _serve(self, viewer: Viewer, connection: ServerConnection) -> None:
         """Carry out the operations of a viewer; it gets a turn for each one that it asks for."""
@@ -285,9 +285,3 @@ def _next_s(viewer: Viewer) -> float:
 def _response(status: HTTPStatus, body: bytes, content_type: str) -> Response:
     own = {"Content-Type": f"{content_type}; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
     return Response(status.value, status.phrase, Headers(own | _HEADERS), body)
-
-
-def _close(viewer: Viewer) -> None:
-    """Close the files of a viewer of recordings, which may wait for what is being read."""
-    viewer.plots.close()
-    viewer.show.close()

@@ -56,7 +56,7 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
         "shown": report.state,
         "bad": badness(report.state),
         "rate_hz": _rounded(report.rate_hz),
-        "age_ms": _milliseconds(report.age_ns),
+        "age_ms": _rounded(report.age_ns, 1e6, 3),
         "sensors": driver.structure.n_sensors,
         "fresh": report.fresh,
         "dropped": report.counters.get("dropped", 0),
@@ -77,7 +77,7 @@ def state_of(driver: ShownDriver, report: DriverReport) -> dict[str, Any]:
                 "bus": report.buses[patch.bus].name,
                 "state": (state := report.state_of(patch)),
                 "bad": badness(state),
-                "age_ms": _milliseconds(patch.age_ns),
+                "age_ms": _rounded(patch.age_ns, 1e6, 3),
                 "sensors": patch.sensors,
                 "fresh": patch.fresh,
                 "rate_hz": _rounded(patch.rate_hz),
@@ -157,9 +157,5 @@ def _common_patch(structure: Structure, sensors: npt.NDArray[np.intp]) -> dict[s
     return {"bus": structure.buses[int(structure.patch_bus[patch])], "patch": structure.patch_names[patch]}
 
 
-def _rounded(rate_hz: float | None) -> float | None:
-    return None if rate_hz is None else round(rate_hz, 2)
-
-
-def _milliseconds(age_ns: int | None) -> float | None:
-    return None if age_ns is None else round(age_ns / 1e6, 3)
+def _rounded(value: float | None, unit: float = 1.0, digits: int = 2) -> float | None:
+    return None if value is None else round(value / unit, digits)

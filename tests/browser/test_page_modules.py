@@ -158,8 +158,6 @@ def test_each_level_is_farther_from_the_ground_in_grey(tell: Callable[..., Any],
     assert all(later - earlier > 5 for earlier, later in pairwise(rising[::25]))
 
 
-# -- history.js ----------------------------------------------------------------------------------------------------
-
 PAST = """(() => {
     const past = new m.Past(a[0]);
     const sheet = { status: new Uint8Array(1000), shear: null, scale: [0, 1], mode: 'raw' };
@@ -312,8 +310,6 @@ def test_ages_rates_and_counts_look_as_in_the_terminal(tell: Callable[..., Any])
     assert tell("format.js", "m.range(0, 150000, 'Pa')") == ["0", "150 kPa"]
 
 
-# -- tree.js -------------------------------------------------------------------------------------------------------
-
 TREE = """m.rowsOf(a[0], new Map(a[1])).map(function told(row) {
     return [row.key, row.bad, (row.children ?? []).map(told)];
 })"""
@@ -405,8 +401,6 @@ def test_no_taxels_and_a_single_one(tell: Callable[..., Any]) -> None:
     assert np.isfinite(eye).all()
     assert np.linalg.norm(np.subtract(eye, [1, 2, 3])) < 0.1
 
-
-# -- picking.js, overlay.js ----------------------------------------------------------------------------------------
 
 PICK = """m.pick({
     project: (x, y, z) => [x, y, z], pixels: 40, camera: { far: 100, position: { x: 0, y: 0, z: -100 } },

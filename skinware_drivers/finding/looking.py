@@ -20,7 +20,7 @@ from skinware_drivers.running.news import reason_text, share_of_time
 from skinware_drivers.streams.dds import HeardTopic, TopicBus
 
 _CAN_PAYLOAD = 64
-_IDENTIFY_S = 5.0
+_IDENTIFY_S, _DISCOVERY_S = 5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,9 @@ async def ask_port(path: str, drivers: Mapping[str, type[AnyAdapter]]) -> ProbeA
 def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAdapter]]) -> list[HeardTopic]:
     """Return the topics of a domain (``dds://0``, ``ros2://0``), and which drivers can read each; nothing is published.
 
+    Args:
+        duration_s: to listen, at least 3 s: programs that run already are found one after the other.
+
     Raises:
         BusNotAvailable: the domain cannot be joined.
     """
@@ -166,7 +169,7 @@ def topics_on(bus_name: str, duration_s: float, drivers: Mapping[str, type[AnyAd
     bus.topics = ()
     bus.open()
     try:
-        time.sleep(duration_s)
+        time.sleep(max(duration_s, _DISCOVERY_S))
         found = bus.heard()
     finally:
         bus.close()

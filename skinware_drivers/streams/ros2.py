@@ -1,8 +1,9 @@
 """Topics of ROS 2 as a skin: point clouds, pictures, arrays, forces, known messages of tactile sensors, and any other.
 
 A sample of a topic (a record of :mod:`skinware_drivers.streams.dds`) becomes a frame for each of its modules: the
-source's time u32, the values as the message has them, and a status byte for each if the map names a field for it. The
-places of the values in a sample are learnt of one, and hold as long as all lengths and texts in it stay the same.
+source's time u32, the values as the message has them, a status byte for each if the map names a field for it, and the
+message's number if the map names one. The places of the values in a sample are learnt of one, and hold as long as all
+lengths and texts in it stay the same.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from skinware.ros_types import Definitions
 from skinware.sensor_types import SensorType
 from skinware.status import Status
 from skinware_drivers.description import Module, Patch, Sensor
-from skinware_drivers.fields import NO_NUMBER, AnyFlag, Identifier, Match, StatusBytes
+from skinware_drivers.fields import NO_NUMBER, AnyFlag, Identifier, Match, SequenceNumber, StatusBytes
 from skinware_drivers.layout import Frame, Layout, Values
 from skinware_drivers.link import Link
 from skinware_drivers.operations import operation
@@ -300,14 +301,16 @@ def _frame(number: int, part: ModulePart, patch: int, *, is_timed: bool) -> Fram
     flags: list[AnyFlag] = list(NO_NUMBER) if part.dtype.kind == "f" else []
     if part.doubt is not None:
         flags.append(StatusBytes(end, Status.SUSPECT))
+    number_at, bytes_of_it = end if part.doubt is None else end + count, part.number[2] if part.number else 0
     return Frame(
         f"module {number}",
         [Identifier(number)],
-        [end if part.doubt is None else end + count],
+        [number_at + bytes_of_it],
         Values(SOURCE_TIME.end, part.dtype.str, count),
         patch=patch,
         module=number,
         flags=flags,
+        sequence=SequenceNumber(number_at, f"<u{bytes_of_it}") if bytes_of_it else None,
         time=SOURCE_TIME if is_timed else None,
     )
 

@@ -1,27 +1,4 @@
-"""Read the file that says what the fields of topics mean, and guess one of a message.
-
-::
-
-    format = "skinware-ros2-map"
-    version = 1
-
-    [[topic]]
-    name = "/hand/touch"
-    type = "my_msgs/msg/Hand"
-
-    [[topic.values]]                # none: as the driver knows the type
-    field = "palm"
-    patch = "left hand"
-    module = "palm"
-    taxels = [3, 4]
-    unit = "N"
-
-    [definition]                    # of types that the driver does not know, as in .msg files
-    "my_msgs/Hand" = \"\"\"
-    std_msgs/Header header
-    float32[12] palm
-    \"\"\"
-"""
+"""Read the file that says what the fields of topics mean (docs/drivers/ros2.md), and guess one of a message."""
 
 from __future__ import annotations
 
@@ -42,6 +19,7 @@ from skinware_drivers.streams.ros2_presets import PRESETS, TEXTS
 
 _FORMAT, _VERSION = "skinware-ros2-map", 1
 _NOT_SHOWN = re.compile(r"(^|\.)(header|stamp|\w*stamp|time|seq|id|\w*_id|index)(\.|$)")
+_COUNTING = ("seq", "sequence", "sequence_number", "header.seq")
 _AXES = re.compile(r"(.*[._])?([xyz])")
 
 
@@ -138,6 +116,7 @@ def guessed(topic: str, type_name: str, message: CdrMessage, definitions: Defini
 
 def _rules(message: CdrMessage) -> Iterator[FieldRule]:
     of_axes: dict[str, list[str]] = {}
+    number = next((name for name in _COUNTING if name in message.numbers), "")
     for name in message.numbers:
         if _NOT_SHOWN.search(name):
             continue
@@ -149,7 +128,8 @@ def _rules(message: CdrMessage) -> Iterator[FieldRule]:
             continue
         module = group.rstrip("._").replace(".", " ") or "values"
         if len(names) == 3:
-            yield FieldRule(tuple(names), ("force_x", "force_y", "force_z"), module=module, taxels=count)
+            yield FieldRule(tuple(names), ("force_x", "force_y", "force_z"), module=module, taxels=count, number=number)
         else:
             for name in names:
-                yield FieldRule(name, module=module if len(names) == 1 else name.replace(".", " "), taxels=count)
+                own = module if len(names) == 1 else name.replace(".", " ")
+                yield FieldRule(name, module=own, taxels=count, number=number)

@@ -45,6 +45,7 @@ class FieldRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         position: fields with x, y and z of each taxel, m.
         normal: fields with the components of its normal.
         status: a field that is not 0 where a value is doubtful; with ``!`` before it, 0.
+        number: a field that the publisher counts up with each message; missing numbers are counted.
     """
 
     field: str | tuple[str, ...]
@@ -57,6 +58,7 @@ class FieldRule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     position: tuple[str, str, str] | None = None
     normal: tuple[str, str, str] | None = None
     status: str = ""
+    number: str = ""
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -72,6 +74,7 @@ class ModulePart:
         places: of the values of all taxels, for each type.
         dtypes: of each type, with byte order.
         doubt: places, dtype and whether 0 is doubtful, of a number for each taxel.
+        number: place and dtype of the message's number, and bytes of it that :meth:`body` has.
         position_m: (taxels, 3) float64; None: not known.
         normal: (taxels, 3) float64 of any length but 0; None: not known.
         frame: coordinate frame of the positions.
@@ -84,6 +87,7 @@ class ModulePart:
     places: tuple[Places, ...]
     dtypes: tuple[str, ...]
     doubt: tuple[Places, str, bool] | None = None
+    number: tuple[int, str, int] | None = None
     position_m: npt.NDArray[np.float64] | None = None
     normal: npt.NDArray[np.float64] | None = None
     frame: str = ""
@@ -100,18 +104,21 @@ class ModulePart:
     @property
     def form(self) -> tuple[Any, ...]:
         """Everything that is the same as long as the values are of the same sensors."""
-        return self.kind, self.types, self.taxels, self.dtype, self.doubt is not None
+        return self.kind, self.types, self.taxels, self.dtype, self.doubt is not None, self.number and self.number[1:]
 
     def body(self, sample: bytes) -> bytes:
-        """Return the values taxel by taxel, and then a status byte for each if the message has one."""
+        """Return the values taxel by taxel, then a status byte for each and the message's number, if it has these."""
         columns = gathered(sample, self.places, self.dtypes)
-        values = np.stack(columns, axis=1).astype(self.dtype).tobytes()
-        if self.doubt is None:
-            return values
-        places, dtype, is_inverted = self.doubt
-        [told] = gathered(sample, [places], [dtype])
-        status = np.where((told == 0) == is_inverted, int(Status.SUSPECT), 0).astype(np.uint8)
-        return values + np.repeat(status, len(self.types)).tobytes()
+        body = np.stack(columns, axis=1).astype(self.dtype).tobytes()
+        if self.doubt is not None:
+            places, dtype, is_inverted = self.doubt
+            [given] = gathered(sample, [places], [dtype])
+            status = np.where((given == 0) == is_inverted, int(Status.SUSPECT), 0).astype(np.uint8)
+            body += np.repeat(status, len(self.types)).tobytes()
+        if self.number is not None:
+            place, dtype, size = self.number
+            body += np.frombuffer(sample, dtype, 1, place).astype(f"<u{size}").tobytes()
+        return body
 
     def pieces(self) -> list[ModulePart]:
         """Return this part, or parts of at most ``MOST_VALUES`` values, of whole rows if it has any; names are cut."""
@@ -244,21 +251,17 @@ def _of_rule(rule: FieldRule, message: CdrMessage, topic: str) -> dict[tuple[str
         key = rule.patch or topic, _module_name(rule, message, within)
         while key in found:
             key = key[0], f"{key[1]} again"
-        doubt = _doubt(rule.status, message, within, count)
-        position = _vectors(message, rule.position, within, count)
-        normal = _vectors(message, rule.normal, within, count)
-        frame = frame_of(message, topic)
         found[key] = ModulePart(
-            key[0],
-            key[1],
+            *key,
             kind,
             types,
             tuple(places),
             tuple(dtypes),
-            doubt,
-            position_m=position,
-            normal=normal,
-            frame=frame,
+            _doubt(rule.status, message, within, count),
+            _number(rule.number, message, within),
+            position_m=_vectors(message, rule.position, within, count),
+            normal=_vectors(message, rule.normal, within, count),
+            frame=frame_of(message, topic),
         )
     return found
 
@@ -305,6 +308,16 @@ def _doubt(status: str, message: CdrMessage, within: Indices, count: int) -> tup
     if len(places) not in (1, count):
         raise ValueError(f"{status} has {len(places)} values for {count} taxels")
     return np.broadcast_to(places, count), dtype, status.startswith("!")
+
+
+def _number(name: str, message: CdrMessage, within: Indices) -> tuple[int, str, int] | None:
+    if not name:
+        return None
+    found = message.numbers.get(name, {})
+    number = found.get(within) or found.get(())
+    if number is None or number.length != 1 or number.dtype[1] == "f":
+        raise ValueError(f"{name} is no single whole number")
+    return number.start, number.dtype, min(np.dtype(number.dtype).itemsize, 4)
 
 
 def _name(text: str) -> str:

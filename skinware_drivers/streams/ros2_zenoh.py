@@ -66,18 +66,6 @@ class ZenohTopicBus(TopicBus):
         return ZenohPort(self.name, self._place, self._options, topics)
 
 
-def publisher_of(token: str) -> tuple[str, str]:
-    """Return topic and type in DDS of the publisher with a token.
-
-    Raises:
-        ValueError: it is no token of a publisher.
-    """
-    parts = token.split("/")
-    if len(parts) != _TOKEN_PARTS or parts[5] != "MP":
-        raise ValueError(f"{token!r} is no token of a publisher")
-    return parts[9].replace("%", "/"), parts[10]
-
-
 class ZenohPort(TopicPort):
     """A session of zenoh that reads topics.
 
@@ -117,12 +105,13 @@ class ZenohPort(TopicPort):
         has_changed = bool(self._tokens)
         while self._tokens:
             token, is_there = self._tokens.popleft()
-            with contextlib.suppress(ValueError):
-                topic, type_name = publisher_of(token)
-                if is_there:
-                    self.came(TopicSource(gid(token), f"rt{topic}", type_name, time_ns))
-                else:
-                    self.went(gid(token))
+            parts = token.split("/")
+            if len(parts) != _TOKEN_PARTS or parts[5] != "MP":  # of something else
+                continue
+            if is_there:
+                self.came(TopicSource(gid(token), f"rt{parts[9].replace('%', '/')}", parts[10], time_ns))
+            else:
+                self.went(gid(token))
         return has_changed
 
     def read(self, size: int) -> bytes:  # noqa: ARG002

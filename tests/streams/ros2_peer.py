@@ -7,8 +7,9 @@ the values that it shows.
 from __future__ import annotations
 
 import struct
+import threading
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from cyclonedds.idl import make_idl_struct
@@ -95,6 +96,35 @@ InspireTouch = make_idl_struct(
     "inspire.inspire_hand_touch",
     {name: idl.sequence[idl.int16, n] for name, n in _TOUCH.items()},
 )
+
+
+class Talker:
+    """Publishes samples of rising numbers, every 10 ms, as long as it is entered.
+
+    Attributes:
+        number: of the next sample.
+        is_silent: whether it pauses.
+    """
+
+    def __init__(self, publish: Callable[[int], object], first: int = 0) -> None:
+        self.publish, self.number, self.is_silent = publish, first, False
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        while not self._over.wait(0.01):
+            if not self.is_silent:
+                self.publish(self.number)
+                self.number += 1
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+        del self.publish  # and what it publishes with
 
 
 class Case(NamedTuple):

@@ -10,7 +10,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,13 @@ from cyclonedds.topic import Topic
 
 from skinware import DriverReader, DriverSnapshot, Namespace
 from skinware.errors import BusError, ConfigurationError
+from skinware.ros_types import Definitions
 from skinware.status import Status
+from skinware_drivers.streams.cdr import CdrMessage
 from skinware_drivers.streams.dds import record
 from skinware_drivers.streams.ros2 import Ros2Driver, Ros2Options
-from skinware_drivers.streams.ros2_presets import PRESETS
+from skinware_drivers.streams.ros2_parts import FieldRule, by_rules
+from skinware_drivers.streams.ros2_presets import PRESETS, TEXTS
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import refused, run, running
@@ -44,7 +47,9 @@ from tests.streams.ros2_peer import (
     Channel,
     Header,
     TactileState,
+    Talker,
     Time,
+    Vector3,
     case_of,
     header,
     message,
@@ -61,41 +66,12 @@ def domain(namespace: Namespace, monkeypatch: pytest.MonkeyPatch) -> int:
     return own_domain(namespace, monkeypatch)
 
 
-class Program:
-    """A program that publishes samples of rising numbers, every 10 ms.
-
-    Attributes:
-        number: of the newest sample.
-        is_silent: whether it pauses.
-    """
-
-    def __init__(self, domain: int, topic: str, idl_type: Any, sample: Callable[[int], Any], first: int = 0) -> None:
-        self.participant = DomainParticipant(domain)
-        self.writer = DataWriter(self.participant, Topic(self.participant, topic, idl_type))
-        self.sample, self.number, self.is_silent = sample, first, False
-        self._over = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._over.wait(0.01):
-            if not self.is_silent:
-                self.writer.write(self.sample(self.number))
-                self.number += 1
-
-    def close(self) -> None:
-        self._over.set()
-        self._thread.join()
-        del self.writer, self.participant
-
-
 @contextlib.contextmanager
-def published(domain: int, case: Case, topic: str = "rt/touch", **more: Any) -> Iterator[Program]:
-    program = Program(domain, topic, case.idl_type, more.pop("sample", case.sample), **more)
-    try:
-        yield program
-    finally:
-        program.close()
+def published(domain: int, case: Case, topic: str = "rt/touch", **more: Any) -> Iterator[Talker]:
+    participant, sample = DomainParticipant(domain), more.pop("sample", case.sample)
+    writer = DataWriter(participant, Topic(participant, topic, case.idl_type))
+    with Talker(lambda number: writer.write(sample(number)), **more) as talker:
+        yield talker
 
 
 def driven(domain: int, **options: Any) -> Any:
@@ -214,12 +190,12 @@ def test_nothing_is_published_and_only_one_type_is_asked_for(domain: int) -> Non
     ours = DomainParticipant(domain)
     publications = BuiltinDataReader(ours, BuiltinTopicDcpsPublication)
     subscriptions = BuiltinDataReader(ours, BuiltinTopicDcpsSubscription)
-    with published(domain, case_of("std_msgs/msg/Float32MultiArray")) as program, driven(domain) as skin:
+    with published(domain, case_of("std_msgs/msg/Float32MultiArray")), driven(domain) as skin:
         read_until(skin.reader, is_whole)
         [reader] = [one for one in subscriptions.take(100) if not one.topic_name.startswith("DCPS")]
         assert (reader.topic_name, reader.type_name) == ("rt/touch", "std_msgs::msg::dds_::Float32MultiArray_")
         assert re.fullmatch(rb"\w+=\w+;", reader.qos[Policy.Userdata].data)  # without it, rmw_cyclonedds warns
-        assert {one.participant_key for one in publications.take(100)} == {program.participant.guid}
+        assert len({one.participant_key for one in publications.take(100)}) == 1
 
 
 def test_the_time_of_the_header(domain: int) -> None:
@@ -269,6 +245,7 @@ patch = "left hand"
 taxels = [2, 3]
 quantity = "warmth"
 unit = "K"
+number = "seq"
 
 [[topic]]
 name = "/plain"
@@ -281,6 +258,7 @@ uint8 OTHER=1
 Finger[<=5] fingers
 float64[6] palm
 bool dummy false
+uint8 seq
 '''
 "my_msgs/Finger" = '''
 string name
@@ -288,8 +266,7 @@ geometry_msgs/Vector3 tip
 bool good
 '''
 """
-_Vector3 = message("geometry_msgs", "Vector3", x=idl.float64, y=idl.float64, z=idl.float64)
-_Finger = message("my_msgs", "Finger", name=str, tip=_Vector3, good=bool)
+_Finger = message("my_msgs", "Finger", name=str, tip=Vector3, good=bool)
 _Hand = message(
     "my_msgs",
     "Hand",
@@ -297,12 +274,13 @@ _Hand = message(
     fingers=idl.sequence[_Finger, 5],
     palm=idl.array[idl.float64, 6],
     dummy=bool,
+    seq=idl.uint8,
 )
 
 
 def _hand(number: int) -> Any:
-    fingers = [_Finger(name, _Vector3(number, -1, number / 4), name != "thumb") for name in ("thumb", "index")]
-    return _Hand(header(number), fingers, ramp(number, 6), True)
+    fingers = [_Finger(name, Vector3(number, -1, number / 4), name != "thumb") for name in ("thumb", "index")]
+    return _Hand(header(number), fingers, ramp(number, 6), True, (number + number // 4) % 256)  # one in five is lost
 
 
 _HAND = Case("my_msgs/msg/Hand", _Hand, _hand, lambda n: [n, n / 4] * 2 + ramp(n, 6), [])
@@ -326,6 +304,9 @@ def test_a_map(domain: int, tmp_path: Path) -> None:
         assert any(same(frame.values[:10], _HAND.shown(number)) for number in range(program.number + 1))
         assert (frame.status[:2] == Status.SUSPECT).all()
         assert not frame.status[2:].any()
+        later = read_until(skin.reader, lambda f: f.values[4] > frame.values[4] + 250)
+        lost = [skin.reader.patch_counters(each)[0]["sequence_lost"] for each in (frame, later)]
+        assert 40 < lost[1] - lost[0] <= 1 + (later.values[4] - frame.values[4]) / 4  # a silence hides some
 
 
 def test_a_quantity_in_two_units_is_refused(tmp_path: Path) -> None:
@@ -375,6 +356,7 @@ def test_fields_that_a_map_names_and_messages_lack(tmp_path: Path) -> None:
         ('field = "palm"', 'field = "sole"'),
         ("taxels = [2, 3]", "taxels = 7"),
         ('"!fingers.good"', '"palm"'),
+        *(('"seq"', f'"{name}"') for name in ("none", "palm", "fingers.tip.x")),
     ):
         path.write_text(MAP.replace(*change))
         driver = Ros2Driver(Ros2Options(map=str(path)))
@@ -396,6 +378,10 @@ def test_version_2_of_the_encoding_and_the_other_byte_order() -> None:
     [of_single] = [topic.number for topic in single.topics]
     single._split(of_single, bytes(4) + big)
     assert single._plans[of_single].parts[0].body(big) == np.array([1.5], "<f8").tobytes()
+    wide = b"\0\0\0\0" + np.array([-2], ">i8").tobytes()
+    message = CdrMessage(wide, Definitions("std_msgs/msg/Int64", TEXTS))
+    [part] = by_rules(FieldRule("data", number="data"))(message, "/t")
+    assert part.body(wide) == np.array([-2], "<i8").tobytes() + b"\xfe\xff\xff\xff"
 
 
 @pytest.mark.parametrize("case", _ALL, ids=lambda case: case.type_name + str(case is RAW_XELA))
@@ -454,23 +440,18 @@ def test_topics_that_are_not_there(domain: int) -> None:
 def test_a_map_is_written_of_one_message(domain: int, tmp_path: Path) -> None:
     definitions = tmp_path / "my_msgs" / "msg"
     definitions.mkdir(parents=True)
-    (definitions / "Hand.msg").write_text("std_msgs/Header header\nFinger[<=5] fingers\nfloat64[6] palm\nbool dummy\n")
-    path = tmp_path / "map.toml"
-    asking = (
-        "skin-config",
-        f"dds://{domain}",
-        "write_map",
-        "--driver",
-        "ros2",
-        "--option",
-        "topic=/hand",
-        f"file={path}",
+    (definitions / "Hand.msg").write_text(
+        "std_msgs/Header header\nFinger[<=5] fingers\nfloat64[6] palm\nbool dummy\nuint8 seq\n"
     )
+    path = tmp_path / "map.toml"
+    writing = ["write_map", "--driver", "ros2", "--option", "topic=/hand"]
+    asking = ("skin-config", f"dds://{domain}", *writing, f"file={path}")
     with published(domain, _HAND, "rt/hand") as program:
         failed = refused(*asking, f"definitions={tmp_path}")
         assert "my_msgs/msg/Finger.msg" in failed.stderr
         (definitions / "Finger.msg").write_text("string name\ngeometry_msgs/Vector3 tip\nbool good\n")
         assert "4 fields of my_msgs/msg/Hand" in " ".join(run(*asking, f"definitions={tmp_path}").stdout.split())
+        assert path.read_text().count('number = "seq"') == 4
         with driven(domain, map=str(path)) as skin:
             frame = read_until(skin.reader, is_whole)
             tips = [value for n in range(program.number + 1) for value in [[n, -1, n / 4]]]
@@ -482,7 +463,7 @@ def test_the_commands(domain: int, tmp_path: Path) -> None:
     """Emulated topics are found, read, captured and replayed."""
     with running("skin-emulate", "--driver", "ros2", "--bus", f"dds://{domain}", "--message", "points") as emulated:
         emulated.wait_for("ready")
-        [bus] = json.loads(run("skin-find", f"dds://{domain}", "--seconds", "3", "--json").stdout)["buses"]
+        [bus] = json.loads(run("skin-find", f"dds://{domain}", "--json").stdout)["buses"]
         [topic] = [each for each in bus["topics"] if each["publishers"]]
         assert (topic["topic"], topic["drivers"]) == ("rt/touch", ["ros2"])
         capture = f"{tmp_path}/touch.mcap"

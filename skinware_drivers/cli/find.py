@@ -264,7 +264,7 @@ def _bus_lines(bus: dict[str, Any]) -> list[str]:
     if bus["used_by"] is not None:
         lines += _wrapped(f"{bus['used_by']} runs on it")
     heard, probe, topics = bus["heard"], bus["probe"], bus.get("topics")
-    for one in topics or ():
+    for one in sorted(topics or (), key=lambda each: not each.drivers):
         readers = f"; read by {', '.join(one.drivers)}" if one.drivers else ""
         lines += _wrapped(f"{one.topic}: {one.type_name}, {plural(one.publishers, 'publisher')}{readers}")
     if topics == []:

@@ -15,10 +15,11 @@ import pytest
 from skinware import Namespace
 from skinware.cli._command import exit_status
 from skinware_drivers.can import roboskin_setup
-from skinware_drivers.cli.find import command
+from skinware_drivers.cli.find import as_text, command
 from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
+from skinware_drivers.streams.dds import HeardTopic
 from skinware_drivers.testing.driving import emulated_on_a_pty
 from tests.commands import running
 from tests.finding.fakes import see_only
@@ -223,6 +224,13 @@ def test_mistakes_get_one_clear_line_and_the_right_exit_code(
     printed = capsys.readouterr()
     assert words in printed.err
     assert printed.out == ""
+
+
+def test_topics_that_a_driver_reads_come_first() -> None:
+    topics = [HeardTopic("rr/tareReply", "T", 1), HeardTopic("rt/touch", "U", 2, ("ros2",))]
+    bus = {"bus": "dds://0", "used_by": None, "heard": None, "probe": None, "topics": topics}
+    _, *lines = as_text({"can": {"interfaces": [], "advice": []}, "buses": [bus], "ports": []})
+    assert [line.split()[0] for line in lines] == ["rt/touch:", "rr/tareReply:"]
 
 
 def test_rules_for_what_is_plugged_in(capsys: pytest.CaptureFixture[str], machine: Callable[..., None]) -> None:

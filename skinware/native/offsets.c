@@ -20,7 +20,6 @@ static void step_mode(struct patch *p, double passed_s) {
     const double found = p->sums[FOUND] / reach - ahead;
     const double trust = is_known ? 1 - FEW_TAXELS / p->sums[FREE] : 0;
     double total, most, share, news;
-    p->variance += p->agility * passed_s;
     if (is_known) {
         p->unknown_s = 0;
     } else {
@@ -33,7 +32,7 @@ static void step_mode(struct patch *p, double passed_s) {
     news = share * fmin(fmax(found, -most), most);
     p->move = ahead + news;
     p->sure = ahead + share * news;
-    p->variance *= 1 - share;
+    p->variance = (1 - share) * (1 - share) * p->variance + share * share / precision;
     if (!is_known)
         return;
     if (found * found != MEDIAN2 * total)
@@ -168,9 +167,12 @@ void follow_common(struct baseline *b, double passed_s) {
     int64_t number, i;
     if (passed_s <= 0 || b->has_no_common)
         return;
-    for (number = 0; number < b->n_patches; number++)
+    for (number = 0; number < b->n_patches; number++) {
+        struct patch *p = &b->patches[number];
+        p->variance += p->agility * passed_s;
         for (i = 0; i < 4; i++)
-            b->patches[number].sums[i] = 0;
+            p->sums[i] = 0;
+    }
     for (number = 0; number < b->n_runs; number++)
         sum_run(b, &b->runs[number], &b->patches[b->runs[number].patch]);
     for (number = 0; number < b->n_patches; number++)

@@ -665,6 +665,27 @@ def test_a_hand_that_slams_shut_after_a_sag_of_the_supply_is_a_touch() -> None:
     assert min(shares[4:]) == 1
 
 
+@pytest.mark.parametrize("period_s", [0.1, 0.137])
+@pytest.mark.parametrize(("step", "noise"), [(1.0, 0.8), (0.0, 0.1)])
+def test_a_touch_is_felt_in_a_hum_that_changes_from_sample_to_sample(
+    period_s: float, step: float, noise: float
+) -> None:
+    random, load = np.random.default_rng(6), on(5, 6, load=25.0) + on(30, load=12.0)
+    baseline, gain = Baseline(MODULE, np.zeros(N, int), resolution=step), 1 + 0.3 * random.standard_normal(N)
+    for number in range(20 * 50):
+        time_s = number / 20
+        hum = 10 * np.sin(2 * np.pi * time_s / period_s + 0.9)
+        values = 60 + hum * gain.clip(0.1) + load * (30 <= time_s < 40) + noise * random.standard_normal(N)
+        calm = baseline.update(number * 50_000_000, np.round(values) if step else values)
+        if time_s > 8:
+            assert not calm.touched[load == 0].any(), f"{time_s} s"
+        if 30.5 < time_s < 40:
+            assert calm.touched[load > 0].all(), f"{time_s} s"
+            assert np.abs(calm.value - load).max() < 0.2 * load.max(), f"{time_s} s"
+        if time_s > 41:
+            assert not calm.touched.any(), f"{time_s} s"
+
+
 def test_offsets_are_as_uncertain_as_they_are_wrong_while_taxels_drift_by_themselves() -> None:
     """Taxels begin to drift after 20 s, each at a speed of its own, as where a hand warms them; a grip of 2 minutes."""
     random = np.random.default_rng(3)

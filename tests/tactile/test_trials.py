@@ -7,8 +7,6 @@ import pytest
 from tests.tactile.trials import TRIALS, run
 
 SHORT = [trial for trial in TRIALS if trial.until_s <= 450 and not trial.alone]
-HALF_THE_RATE = {"common sine of 10 counts at 0.1 s"}
-"""A hum of as many counts from frame to frame hides the beginning of a hold at 20 Hz."""
 
 pytestmark = [pytest.mark.thorough, pytest.mark.timeout(400)]
 
@@ -17,11 +15,12 @@ def test_short_trials_hold() -> None:
     """Hums and waves, spikes, losses, covers, small presses, bent responses."""
     results = run(SHORT, seeds=4, rate_hz=20)
     missed = {trial.name: result.misses(trial) for trial, result in zip(SHORT, results, strict=True)}
-    assert {name for name, of in missed.items() if of} <= HALF_THE_RATE, missed
+    assert not any(missed.values()), missed
 
 
-@pytest.mark.parametrize("name", ["binary", "three levels"])
-def test_few_levels_are_enough(name: str) -> None:
+@pytest.mark.parametrize("name", [trial.name for trial in TRIALS if trial not in SHORT and trial.until_s < 2500])
+def test_other_trials_hold(name: str) -> None:
+    """Grips that loosen, grasps for half an hour, heat, humidity, steps of boards, taxels with few levels."""
     trial = next(trial for trial in TRIALS if trial.name == name)
     assert run([trial], seeds=4, rate_hz=20)[0].misses(trial) == {}
 

@@ -109,7 +109,6 @@ class CommonMode:
         ahead = self.rate * (known * passed_s)
         found = found - ahead
         trust = np.where(known, 1 - FEW_TAXELS / np.maximum(free, 1), 0)
-        self.variance += self.agility * passed_s
         unknown = ~known
         self.variance[unknown] += self.rate2[unknown] * (2 * self.unknown_s[unknown] + passed_s) * passed_s
         self.unknown_s[unknown] += passed_s
@@ -119,7 +118,7 @@ class CommonMode:
         share = trust * self.variance / total
         news = share * np.minimum(np.maximum(found, -most), most)
         move = ahead + news
-        self.variance *= 1 - share
+        self.variance = (1 - share) ** 2 * self.variance + share * share / np.maximum(precision, 1e-30)
         towards = np.sign(found * found - _MEDIAN * total) * known
         self.agility *= np.exp(min(passed_s / MATCH_S, 1.0) * towards)
         least = 1e-5 / np.maximum(precision, 1e-30)
@@ -203,11 +202,13 @@ class Offsets:
         """
         if passed_s <= 0:
             return
+        mode = self.common
+        mode.variance += mode.agility * passed_s
         typical = self.patches.spread(self.typical)
         free = free & (self.noise2 >= np.float32(QUIET) * typical)
         own = np.maximum(self.noise2, typical) + self.variance
         weight = np.where(free, np.float32(1) / (own + hidden2), np.float32(0))
-        limit = np.float32(2) * np.sqrt(own + self.gain * self.gain * self.patches.spread(self.common.variance))
+        limit = np.float32(2) * np.sqrt(own + self.gain * self.gain * self.patches.spread(mode.variance))
         clipped = np.minimum(np.maximum(deviation, -limit), limit)
         np.copyto(clipped, 0, where=~free)
         weights = np.maximum(self.patches.sum(weight), 1e-30)

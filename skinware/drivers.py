@@ -161,11 +161,11 @@ class Drivers(Generic[ReaderT]):
         """Return the newest sample of a service, the same object while there is no newer one; never wait.
 
         Returns:
-            None if it is not followed, has published nothing since it began, or its writer died 0.1 s ago.
+            None if it is not followed, has published nothing since it began, or its writer is dead (killed: 0.1 s ago).
         """
         sample, reader = self._newest.get(name), self.readers.get(name)
-        is_newest = sample is not None and reader is not None and reader.newest_position == sample.position
-        if is_newest and now_ns() < self._alive_until_ns.get(name, 0):
+        is_due = reader is None or reader.moved_on or now_ns() >= self._alive_until_ns.get(name, 0)
+        if not (sample is None or reader is None or is_due or reader.newest_position != sample.position):
             return sample
         newer = self.newest(name, newer_than=sample)
         if newer is not None:

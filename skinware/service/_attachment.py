@@ -72,6 +72,11 @@ class Attachment(Generic[SampleT]):
         return bool(self._ring.state & file_layout.STATE_PAUSED)
 
     @property
+    def moved_on(self) -> bool:
+        """Whether the writer closed the generation at hand or went over to another; a killed one leaves no mark."""
+        return bool(self._ring.state & GENERATION_ENDED)
+
+    @property
     def structure_changed(self) -> bool:
         """Whether the service came back with other columns, so that ``reattach`` is due."""
         return self._moved

@@ -14,7 +14,6 @@ from skinware.memory.namespace import Namespace
 from skinware.memory.ring import ACQUIRED, Sample, SampleT
 from skinware.memory.ring_reader import NEWER, NEXT, RingReader
 from skinware.realtime import NS_PER_S, Periodic, now_ns, short_turns
-from skinware.service._attachment import GENERATION_ENDED
 from skinware.service._taking import Position, Taking
 from skinware.service.messages import ACQUIRE
 
@@ -315,11 +314,6 @@ def samples_after(
 
 class Tap(ServiceReader[SampleT]):
     """A reader whose owner looks for new generations and for the dead, and waits for many readers at once."""
-
-    @property
-    def moved_on(self) -> bool:
-        """Whether the writer closed the generation at hand or went over to another; a killed one leaves no mark."""
-        return bool(self._ring.state & GENERATION_ENDED)
 
     @property
     def head(self) -> bytes:

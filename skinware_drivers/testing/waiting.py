@@ -38,7 +38,7 @@ def require(condition: object, what: str) -> None:
         defect(what)
 
 
-def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0) -> None:
+def wait_until(condition: Callable[[], bool], deadline_s: float = 30.0 * SLOWER) -> None:
     """Wait for a condition; fail the test if it does not come true in time."""
     end = time.monotonic() + deadline_s
     while not condition():

@@ -86,16 +86,9 @@ def test_noise_is_what_half_of_them_do_by_themselves() -> None:
     watching.see(14, 2)
     assert watching.rest.noise(PRESSURE.name) == 1  # count
     assert watching.rest.noise("temperature") == 0.5  # degC for a count
-    watching.rest.begin()
+    watching = Watching()
     for value in (12, 17) * 11:
         watching.see(value)
     assert 2 < watching.rest.noise(PRESSURE.name) <= 5
     watching.see(250, 1)  # later than the first second
     assert watching.rest.noise(PRESSURE.name) <= 5
-
-
-def test_it_begins_anew_on_request() -> None:
-    watching = Watching()
-    watching.see(14, 2)
-    watching.rest.begin()
-    assert (watching.see(80) == 0).all()

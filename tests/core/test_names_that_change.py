@@ -130,7 +130,7 @@ def test_a_living_service_that_is_no_driver_is_looked_at_once(
         look(skin)
         assert sorted(attached) == ["live", "pose", "pose"]
         with monkeypatch.context() as patched:  # a refusal may have been want of memory
-            later_ns = time.monotonic_ns() + 11_000_000_000
+            later_ns = time.monotonic_ns() + 61_000_000_000
             patched.setattr("skinware.drivers.now_ns", lambda: later_ns)
             look(skin)
         assert sorted(attached) == ["live", "pose", "pose", "pose"]

@@ -21,7 +21,7 @@ from skinware_drivers.registry import make_bus
 from skinware_drivers.serial import SerialAdapter, Unframed
 from skinware_drivers.serial.bus import SerialBus
 from skinware_drivers.testing.driving import driving_lines
-from skinware_drivers.testing.waiting import wait_until
+from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.serial.lines import data_frame, is_readable, receive
 from tests.streams.peers import LOCAL, free_port, opened
 
@@ -207,4 +207,4 @@ def test_a_driver_counts_datagrams_that_were_lost_or_overtook_each_other(namespa
 
         wait_until(lambda: counted() == expected)  # each is counted by itself, in another thread
         with DriverReader("finger") as reader:
-            assert reader.read().values.tolist() == [11] * 4
+            read_until(reader, lambda frame: frame.values.tolist() == [11] * 4)

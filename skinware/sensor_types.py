@@ -108,3 +108,14 @@ CATALOGUE: dict[str, SensorType] = {
     )
 }
 """The types of vendor 0, by name."""
+
+NOT_TOUCH = ("temperature", "acceleration", "angular_rate")
+"""Beginnings of the names of types that no touch changes: their sensors are no taxels, and have no rest."""
+
+
+def name_in_module(type_name: str, number: int, is_only: bool) -> str:
+    """Return a sensor's name in its module, by its number from the lowest; empty: that of the module says all."""
+    by_type = type_name.startswith(NOT_TOUCH)
+    if is_only:
+        return type_name if by_type else ""
+    return f"{type_name if by_type else 'taxel'} {number}"

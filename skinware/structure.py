@@ -15,7 +15,7 @@ from skinware.errors import StructureError
 from skinware.geometry import Geometry
 from skinware.matrices import Matrices
 from skinware.realtime import NS_PER_S
-from skinware.sensor_types import SensorType
+from skinware.sensor_types import SensorType, name_in_module
 from skinware.status import LONGEST_PERIOD_S, age_limit_ns
 from skinware.text import nearest_name
 
@@ -288,7 +288,7 @@ class Structure:
         numbers = (self.sensor_uid[of_type] - lowest[module]).tolist()
         is_only = (np.bincount(module, minlength=self.n_modules) == 1)[module].tolist()
         return [
-            text.joined(self.module_names[of], text.name_in_module(type_name, number, is_only=only))
+            text.joined(self.module_names[of], name_in_module(type_name, number, is_only=only))
             for of, number, only in zip(module.tolist(), numbers, is_only, strict=True)
         ]
 
@@ -296,7 +296,7 @@ class Structure:
         """Return what ``sensor_name`` adds to the name of the module: ``taxel 5``; empty where it adds nothing."""
         of_module = self.module_index(int(self.sensor_module[position]))
         type_id = int(self.sensor_type[position])
-        return text.name_in_module(
+        return name_in_module(
             next(t.name for t in self.types if t.id == type_id),
             int(self.sensor_uid[position] - self.sensor_uid[of_module].min()),
             is_only=int((self.sensor_type[of_module] == type_id).sum()) == 1,

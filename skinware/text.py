@@ -179,10 +179,6 @@ def printable(text: str, keep: str = "") -> str:
     return "".join(sign if sign.isprintable() or sign in keep else "?" for sign in text)
 
 
-_BY_TYPE = ("temperature", "acceleration", "angular_rate")
-"""Sensors of these types are called by their type; all others are taxels."""
-
-
 def distinct(names: Sequence[str], owners: Sequence[str], how: str) -> tuple[str, ...]:
     """Return the names; where several things have one name, with what they belong to: ``board 8 on can0``."""
     count = Counter(names)
@@ -216,14 +212,6 @@ def names_in_patches(own_names: Sequence[str], kinds: Sequence[str], patches: Se
             own = f"{own} {number}" if of_kind[patch, kind] > 1 else own
         names.append(own)
     return tuple(names)
-
-
-def name_in_module(type_name: str, number: int, is_only: bool) -> str:
-    """Return a sensor's name in its module, by its number from the lowest; empty: that of the module says all."""
-    by_type = type_name.startswith(_BY_TYPE)
-    if is_only:
-        return type_name if by_type else ""
-    return f"{type_name if by_type else 'taxel'} {number}"
 
 
 def joined(owner: str, name: str) -> str:

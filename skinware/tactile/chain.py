@@ -19,6 +19,7 @@ from skinware import native
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
 from skinware.native import give_arrays
+from skinware.sensor_types import NOT_TOUCH
 from skinware.structure import Structure
 from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
 from skinware.tactile.baseline import SHOWN, UNUSABLE, Baseline, BaselineSettings, Calm
@@ -34,9 +35,6 @@ for _call in (_begin, _end):
     _call.argtypes, _call.restype = (ctypes.c_void_p,), None
 _calm.argtypes, _calm.restype = (*(ctypes.c_void_p,) * 2, ctypes.c_int64, *(ctypes.c_void_p,) * 2), None
 
-RESTLESS = (TEMPERATURE, "acceleration_", "angular_rate_")
-"""Beginnings of the names of types that have no rest to go back to."""
-
 
 class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_field="stage", tag="baseline"):
     """Settings of a baseline as a stage: 0 = no touch; the unit stays.
@@ -49,7 +47,7 @@ class BaselineStageSettings(BaselineSettings, frozen=True, kw_only=True, tag_fie
 
     def stage(self, taxels: Taxels) -> BaselineStage:
         name, unit = taxels.type.name, taxels.type.unit
-        if name.startswith(RESTLESS):
+        if name.startswith(NOT_TOUCH):
             raise ConfigurationError(f"a {name} has no rest to return to")
         if name == "proximity" and unit == "m":
             raise ConfigurationError(
@@ -196,7 +194,7 @@ def _groups(settings: AnySettings, taxels: Mapping[str, Taxels], wanted: Iterabl
     if isinstance(settings, FieldSettings | VectorSettings):
         return [names for names in vectors_of(taxels) if set(names) <= set(wanted)]
     if isinstance(settings, ThermalSettings):
-        return [(name, TEMPERATURE) for name in wanted if TEMPERATURE in taxels and not name.startswith(RESTLESS)]
+        return [(name, TEMPERATURE) for name in wanted if TEMPERATURE in taxels and not name.startswith(NOT_TOUCH)]
     return [(name,) for name in wanted]
 
 

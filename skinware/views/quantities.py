@@ -16,13 +16,11 @@ from skinware.driver_snapshot import DriverSnapshot
 from skinware.geometry import Geometry
 from skinware.nominal_hand import PARTS, NominalHand
 from skinware.sensor_types import (
-    ACCELERATION,
-    ANGULAR_RATE,
     FORCE_Z,
+    NOT_TOUCH,
     PRESSURE,
     SHEAR_X,
     SHEAR_Y,
-    TEMPERATURE,
     SensorType,
 )
 from skinware.state import settling
@@ -39,7 +37,6 @@ HIGHEST = 250
 NO_VALUE = 255
 WITHOUT_VALUE = Status.NO_ACK | Status.MASKED | Status.NEVER_SEEN | Status.NOT_CONNECTED
 """A sensor with one of these bits has no value that means anything."""
-_NO_TOUCH = {t.id for t in (TEMPERATURE, *ACCELERATION, *ANGULAR_RATE)}
 _NORMAL = (FORCE_Z.id, PRESSURE.id)
 _NEVER_SEEN, _ALL_BITS = np.uint8(Status.NEVER_SEEN), np.uint8(0xFF)
 _LONGEST = 127
@@ -87,7 +84,7 @@ class Quantity:
 
     @property
     def is_touch(self) -> bool:
-        return self.type.id not in _NO_TOUCH
+        return not self.type.name.startswith(NOT_TOUCH)
 
     @property
     def total(self) -> Literal["sum", "highest"] | None:
@@ -140,7 +137,7 @@ def types_of(structure: Structure) -> list[SensorType]:
     def rank(t: SensorType) -> tuple[int, ...]:
         if t.id in _NORMAL:
             return 0, -counts[t], _NORMAL.index(t.id)
-        return (1 + (t.id in _NO_TOUCH),)
+        return (1 + t.name.startswith(NOT_TOUCH),)
 
     return sorted((t for t, count in counts.items() if count), key=rank)  # stable
 

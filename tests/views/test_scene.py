@@ -218,7 +218,7 @@ def test_shear_belongs_to_pressure() -> None:
 @pytest.mark.parametrize(
     ("types", "names"),
     [
-        ((TEMPERATURE, PROXIMITY, PRESSURE), ["pressure", "proximity", "temperature"]),
+        ((SensorType("temperature_2", 99, "K"), PROXIMITY, PRESSURE), ["pressure", "proximity", "temperature_2"]),
         ((PRESSURE, FORCE_Z), ["force_z", "pressure"]),
         (FORCE, ["force_z", "force_x", "force_y"]),
     ],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -16,8 +16,8 @@ from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
 from skinware.native import give_arrays
 from skinware.structure import Structure
-from skinware.tactile.arrays import Arrays, Bytes, Columns, Flags, Floats, Whole, rows_of
-from skinware.tactile.neighbours import STRUCTS, Components, area_m2, pitch_m
+from skinware.tactile.arrays import Arrays, Bytes, Columns, Doubles, Flags, Floats, Whole, rows_of
+from skinware.tactile.neighbours import STRUCTS, Components, area_m2, pitch_m, posed
 from skinware.tactile.neighbours import neighbours as neighbours_of
 from skinware.tactile.tracking import ContactKind, Tracker, TrackingSettings
 from skinware.tactile.tracks import TouchedBlobs
@@ -34,27 +34,10 @@ _list.argtypes, _list.restype = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_void_
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """One contact.
+    """One contact: attributes as of :data:`COLUMNS`, NaN where not known.
 
-    Attributes:
-        id: the same as long as it lasts, gaps of 60 ms included.
-        age_s: since it began, s.
-        load: sum of the values of its taxels, in the unit of the values.
-        peak: largest value of its taxels.
-        n: number of its taxels.
-        area_m2: area that they stand for, m2; NaN without places.
-        cop_m: (3,) m, its centre: the mean of the places, weighted by the values; NaN without places.
-        normal: (3,) of length 1, outwards, weighted in the same way; NaN if it is not known.
-        force_n: along the normal, N: the sum of values in N, or of values in Pa by area, at known places; else NaN.
-        frame: name of the coordinate frame, empty if it is not known.
-        velocity_m_s: (3,) m/s, velocity of the centre; NaN without places.
-        kind: a touch (younger than 0.3 s), a hold, or sliding: faster than 5 mm/s at a steady load.
-        slips: its pattern moves along the skin by more than noise and the change of its load explain.
-        provisional: only the last samples speak for it; the baseline has not confirmed it, and its load is 0.
-        clipped: number of its taxels that are at the end of their range: load and force are too small.
-        load_whole: estimate of the load with what threshold and clipping cut off, as of a bell; NaN if most is cut off.
-        uncertainty: how much of the load could be noise or drift, in its unit; NaN if it is not known.
-        taxels: (n,) int64, positions among the n taxels, ascending.
+    ``frame`` is the name of its coordinate frame, empty if it is not known; ``taxels`` are (n,) int64, its positions
+    among all taxels, ascending. Loads and forces of a contact with clipped taxels are too small.
     """
 
     id: int
@@ -174,6 +157,8 @@ class Contacts:
         neighbours: (n, k) int, which taxels lie beside each other, -1 fills its rows; None: not known.
         geometry: places of the n taxels; None, or NaN in it: not known. Contacts then have no centre.
         module: (n,) int, module of each taxel; touched taxels without neighbours are one contact per module.
+        poses: by name of a coordinate frame, (4, 4) its pose in one that they share: contacts are followed across
+            their borders, and have a place in the frame of their peak.
         unit: unit of the values; forces are known where it is ``N`` or ``Pa``.
         tracking: settings of the tracking.
 
@@ -188,6 +173,7 @@ class Contacts:
         geometry: Geometry | None = None,
         *,
         module: npt.NDArray[Any] | None = None,
+        poses: Mapping[str, npt.ArrayLike] | None = None,
         unit: str = "",
         tracking: TrackingSettings | None = None,
     ) -> None:
@@ -197,12 +183,17 @@ class Contacts:
         self._n = n
         geometry = geometry if geometry is not None else Geometry.unknown([""] * n, np.zeros(n, np.uint64))
         area, known = area_m2(geometry), np.isfinite(geometry.position_m).all(axis=1)
-        columns = [geometry.position_m, geometry.normal, area[:, None], np.isfinite(area)[:, None]]
-        of_taxel = np.nan_to_num(np.hstack(columns).astype(np.float64))
         names, number = np.unique(geometry.frame[known].astype(str), return_inverse=True)
         self.frames: tuple[str, ...] = tuple(names.tolist())
-        frame_of = np.full(n, -1, np.int64)
-        frame_of[known] = number
+        self._frame_of = np.full(n, -1, np.int64)
+        self._frame_of[known] = number
+        poses = {name: pose for name, pose in (poses or {}).items() if name in self.frames}
+        common = posed(geometry, poses)
+        self._poses = np.array([poses.get(name, np.eye(4)) for name in self.frames], np.float64) if poses else None
+        columns = [common.position_m, common.normal, area[:, None], np.isfinite(area)[:, None]]
+        of_taxel = np.nan_to_num(np.hstack(columns).astype(np.float64))
+        shared = [self.frames.index(min(poses)) if name in poses else row for row, name in enumerate(self.frames)]
+        frame_of = np.array([*shared, -1])[self._frame_of]
         pitch = pitch_m(geometry)
         median_m = float(np.nanmedian(pitch)) if np.isfinite(pitch).any() else np.nan
         self._tracker = Tracker(of_taxel[:, :3], median_m, tracking)
@@ -229,10 +220,11 @@ class Contacts:
         type_name: str,
         neighbours: npt.NDArray[Any] | None = None,
         tracking: TrackingSettings | None = None,
+        poses: Mapping[str, npt.ArrayLike] | None = None,
     ) -> Self:
         """Make one for the sensors of a type of one driver, in the order of ``structure.index(type_name)``.
 
-        Neighbours are found from the places, as far as they are known, unless they are given.
+        Neighbours are found from places and poses, as far as they are known, unless they are given.
 
         Raises:
             StructureError: the driver has no such sensors.
@@ -241,9 +233,9 @@ class Contacts:
         module = structure.module_of(type_name)
         geometry = None if structure.geometry is None else structure.geometry[structure.index(type_name)]
         if neighbours is None and geometry is not None:
-            neighbours = neighbours_of(geometry)
+            neighbours = neighbours_of(posed(geometry, poses or {}))
         unit = structure.type(type_name).unit
-        return cls(len(module), neighbours, geometry, module=module, unit=unit, tracking=tracking)
+        return cls(len(module), neighbours, geometry, module=module, poses=poses, unit=unit, tracking=tracking)
 
     def update(
         self,
@@ -301,4 +293,17 @@ class Contacts:
                 found[name][: array.size] = array.reshape(-1)
             most = _list(at, time_ns, to)
         columns = {name: self._listed[name][:most].copy() for name in COLUMNS}
+        if self._poses is not None and most:
+            self._to_own_frames(columns, contact_of, self._poses)
         return ContactSet(contact_of=contact_of, beyond=words.beyond, frames=self.frames, **columns)
+
+    def _to_own_frames(self, columns: Arrays, contact_of: npt.NDArray[np.int16], poses: Doubles) -> None:
+        """Express vectors that were found in the frame shared by poses in that of the peak."""
+        taxels, load = (self._given[name][: self._words.n_touched] for name in ("taxels", "load_of"))
+        taxels = taxels[np.argsort(load, kind="stable")]
+        taxels = taxels[(contact_of[taxels] >= 0) & (self._frame_of[taxels] >= 0)]
+        columns["frame"][contact_of[taxels]] = self._frame_of[taxels]  # the last of each contact has its peak
+        pose = poses[columns["frame"]]
+        columns["cop_m"] -= pose[:, :3, 3]
+        for name in _VECTORS:
+            columns[name][:] = np.einsum("ki,kij->kj", columns[name], pose[:, :3, :3])

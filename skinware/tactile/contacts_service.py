@@ -8,7 +8,7 @@ columns: ``sensor_uid`` of each taxel, ``frame_name``, and ``driver``, ``type_na
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -137,7 +137,7 @@ class ContactsWriter(SourceWriter):
         structure: of the driver.
         type_name: which sensors.
         driver: its name, for readers.
-        neighbours, tracking: as for :meth:`.Contacts.of`, which also lists the errors.
+        neighbours, tracking, poses: as for :meth:`.Contacts.of`, which also lists the errors.
         name: of the service.
         options: namespace, slots, rate_hz and group, as for :class:`skinware.service.ServiceWriter`.
     """
@@ -152,11 +152,12 @@ class ContactsWriter(SourceWriter):
         driver: str = "",
         neighbours: npt.NDArray[Any] | None = None,
         tracking: TrackingSettings | None = None,
+        poses: Mapping[str, npt.ArrayLike] | None = None,
         name: str = NAME,
         **options: Unpack[ServiceOptions],
     ) -> None:
-        self._tracking = tracking
-        self._contacts = Contacts.of(structure, type_name, neighbours, tracking)
+        self._followed_by = tracking, poses
+        self._contacts = Contacts.of(structure, type_name, neighbours, *self._followed_by)
         super().__init__(_source(structure, type_name, driver, self._contacts), name, **options)
 
     def publish(self, value: npt.NDArray[Any], touched: Flags, acquired_ns: int, **more: Unpack[More]) -> ContactSet:
@@ -183,7 +184,7 @@ class ContactsWriter(SourceWriter):
             NamespaceError: shared memory is full; the old generation then goes on, too.
         """
         type_name = self.source.type_name
-        contacts = Contacts.of(structure, type_name, neighbours, self._tracking)
+        contacts = Contacts.of(structure, type_name, neighbours, *self._followed_by)
         self._go_on(_source(structure, type_name, self.source.driver, contacts))
         self._contacts = contacts
 

@@ -29,7 +29,6 @@ from skinware.tactile.contacts import ContactSet
 from skinware.tactile.contacts_service import ContactsWriter, More
 from skinware.tactile.health_service import RATE_HZ, ChainHealth, HealthWriter
 from skinware.tactile.motion import MotionWriter
-from skinware.tactile.neighbours import neighbours, posed
 from skinware.tactile.regions import Regions
 from skinware.tactile.source_service import ServiceOptions, SourceWriter
 from skinware.tactile.stages import STRUCTS
@@ -168,7 +167,7 @@ class CalmContacts(DerivedService[ContactsWriter]):
     ) -> None:
         super().__init__(name, driver, into, group)
         self.newest: tuple[ContactSet, Floats] | None = None
-        self._poses = poses or {}
+        self._poses = poses
         self._loads: Loads | None = None
 
     def _follow(self, chain: Chain, rate_hz: float | None) -> None:
@@ -176,14 +175,12 @@ class CalmContacts(DerivedService[ContactsWriter]):
         if self._loads is None:
             self.close()
             return
-        structure, type_name, beside = chain.structure, self._loads.type_name, None
-        if structure.geometry is not None and self._poses:
-            beside = neighbours(posed(structure.geometry[structure.index(type_name)], self._poses))
+        structure, type_name = chain.structure, self._loads.type_name
         if self.writer is not None and self.writer.source.type_name == type_name:
-            self.writer.go_on(structure, neighbours=beside)
+            self.writer.go_on(structure)
         else:
             self.close()
-            more = {"driver": self._driver, "neighbours": beside, "rate_hz": rate_hz}
+            more = {"driver": self._driver, "poses": self._poses, "rate_hz": rate_hz}
             self._open(ContactsWriter, structure, type_name, **more)
 
     def publish(self, acquired_ns: int) -> None:

@@ -63,13 +63,12 @@ def neighbours(geometry: Geometry, radius_m: float | None = None) -> Table:
     return _table(*_on_one_side(geometry.normal, rows[one], rows[other]), n)
 
 
-def posed(geometry: Geometry, poses: Mapping[str, npt.ArrayLike], frame: str = "common") -> Geometry:
+def posed(geometry: Geometry, poses: Mapping[str, npt.ArrayLike]) -> Geometry:
     """Return a geometry with the places of several frames in one, so that contacts across their border are found.
 
     Args:
         geometry: places of n taxels. Those in frames without a pose stay.
-        poses: by name of a frame, (4, 4) its pose in the common one.
-        frame: name of the common one.
+        poses: by name of a frame, (4, 4) its pose in the one that they share, ``common``.
 
     Raises:
         ConfigurationError: a pose that is not (4, 4) finite numbers.
@@ -82,7 +81,7 @@ def posed(geometry: Geometry, poses: Mapping[str, npt.ArrayLike], frame: str = "
         rows = geometry.frame == name
         position[rows] = position[rows] @ pose[:3, :3].T + pose[:3, 3]
         normal[rows] = normal[rows] @ pose[:3, :3].T
-        frames[rows] = frame
+        frames[rows] = "common"
     return replace(geometry, position_m=position, normal=normal, frame=frames.astype(str))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from skinware.realtime import NS_PER_S
 from skinware.tactile.arrays import Arrays, Doubles, Flags, Whole
 from skinware.tactile.meetings import Meetings, fit_bells, resume
-from skinware.tactile.tracks import TRACK, TouchedBlobs, Tracks, assign, correct, expected_at, judge, move, without_nan
+from skinware.tactile.tracks import TRACK, TouchedBlobs, Tracks, assign, correct, expected_at, judge, move
 
 _STRONG, _WEAK, _LEFT, _NEAR = 5.0, 1.5, 0.3, 0.1
 """Gains of a pair that shares half of the smaller one's taxels, any, is what was left behind, or is near: one of the
@@ -179,7 +179,7 @@ class Tracker:
         tracks = self._tracks
         away = expected["place"][:, None] - blobs.cop_m
         squares = np.einsum("ijk,ijk->ij", away, away)
-        reach_m = _DOUBT * without_nan(way_m) + _REACH_PITCHES * self._pitch_m
+        reach_m = _DOUBT * np.nan_to_num(way_m) + _REACH_PITCHES * self._pitch_m
         if len(tracks) <= _MOST_FAST:
             reach_m = np.fmax(reach_m, _DOUBT * way_m + _GATE * np.sqrt(expected["spread"][:, 0]))
         misses = squares / (reach_m**2)[:, None]

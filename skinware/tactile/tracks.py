@@ -92,10 +92,6 @@ def expected_at(tracks: Tracks, time_ns: int) -> Tracks:
     return expected
 
 
-def without_nan(numbers: Doubles) -> Doubles:
-    return np.where(np.isnan(numbers), 0.0, numbers)
-
-
 def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
     """Take in where tracks were found, instead of where they were expected."""
     _correct(tracks.ctypes.data, len(rows), rows.ctypes.data, time_ns)

@@ -7,7 +7,7 @@ import numpy as np
 from skinware.realtime import NS_PER_S
 from skinware.tactile.arrays import Doubles, Whole
 from skinware.tactile.tracking import ContactKind, TrackingSettings
-from skinware.tactile.tracks import LONGEST_GUESS_S, Tracks, without_nan
+from skinware.tactile.tracks import LONGEST_GUESS_S, Tracks
 
 ACCELERATION_M_S2, MANOEUVRE_S, SURPRISE, SHORTEST_S = 0.5, 0.1, 3.0, 1e-3
 CALM, NARROWEST_PITCHES = 3.0, 0.35
@@ -41,7 +41,7 @@ def correct(tracks: Tracks, rows: Whole, time_ns: int) -> None:
     gain = variance / (variance + now["noise"])
     pull = np.where(now["jumps"], 0.0, both / (variance + now["noise"]))
     now["place"] += gain[:, None] * miss
-    now["pace"] += pull[:, None] * without_nan(miss)
+    now["pace"] += pull[:, None] * np.nan_to_num(miss)
     pace += surprise / passed_s**2 - pull * both  # what changed once changes again
     now["spread"] = np.column_stack([gain * now["noise"], both * (1 - gain), pace])
     if now is not tracks:
@@ -58,7 +58,7 @@ def move(tracks: Tracks, before: Tracks, velocity_s: float) -> None:
     velocity = (tracks["found"][known] - before["found"][known]) / passed_s[:, None]
     tracks["steps"][known] += 1
     weight = np.maximum(-np.expm1(-passed_s / velocity_s), 1 / tracks["steps"][known])[:, None]
-    was = without_nan(tracks["velocity"][known])
+    was = np.nan_to_num(tracks["velocity"][known])
     tracks["velocity"][known] = was + weight * (velocity - was)
 
 
@@ -84,7 +84,7 @@ def judge(tracks: Tracks, before: Tracks, time_ns: int, settings: TrackingSettin
     peak += alone * (height - peak)
     measured = pitch_m * np.sqrt(found / (2 * np.pi * np.maximum(height, 1e-9)))
     width += alone * (np.maximum(measured, NARROWEST_PITCHES * pitch_m) - width)
-    motion += calm * (without_nan(now["velocity"]) - motion)
+    motion += calm * (np.nan_to_num(now["velocity"]) - motion)
     is_steady = abs(found - load) <= settings.steady * load
     slowest = np.where(now["kind"] == ContactKind.SLIDING, settings.sliding_m_s / 2, settings.sliding_m_s)
     is_sliding = is_steady & (np.linalg.norm(motion, axis=1) >= slowest)

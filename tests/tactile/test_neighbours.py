@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 
 from skinware.errors import ConfigurationError
 from skinware.geometry import Geometry
-from skinware.tactile.contacts import Contacts
 from skinware.tactile.neighbours import NONE, area_m2, checked, neighbours, neighbours_of_pairs, pitch_m, posed
-from tests.tactile.skins import AT_ONCE, PITCH_M, placed, triangles
+from tests.tactile.skins import PITCH_M, placed, triangles
 
 
 def as_sets(table: npt.NDArray[np.int32]) -> list[set[int]]:
@@ -154,7 +153,7 @@ def test_a_table_is_made_symmetric_or_refused() -> None:
         checked(np.array([[7], [-1]]), 2)
 
 
-def test_a_contact_across_the_border_of_posed_frames_is_one() -> None:
+def test_taxels_across_the_border_of_posed_frames_are_neighbours() -> None:
     side = np.where(np.arange(32) % 8 < 4, "left", "right")
     here = placed(triangles(4, 8), side, normal=[0, 0, 1])
     turn = np.array([[0, -1, 0, 0.5], [1, 0, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1.0]])
@@ -164,10 +163,6 @@ def test_a_contact_across_the_border_of_posed_frames_is_one() -> None:
     together = posed(apart, {"left": np.eye(4), "right": turn})
     assert np.allclose(together.position_m, here.position_m)
     assert set(together.frame) == {"common"}
-    value = np.ones(32)
-    for geometry in (apart, together):
-        contacts = Contacts(32, neighbours(together), geometry, tracking=AT_ONCE)
-        (contact,) = contacts.update(value, value > 0, 0)
-        assert contact.n == 32
+    assert as_sets(neighbours(together)) == as_sets(neighbours(placed(here.position_m)))
     with pytest.raises(ConfigurationError, match="pose of frame 'left'"):
         posed(apart, {"left": np.eye(3)})

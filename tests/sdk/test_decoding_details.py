@@ -13,7 +13,7 @@ import pytest
 
 from skinware import Status
 from skinware.sensor_types import PRESSURE
-from skinware_drivers.bus import Filter, FrameBatch
+from skinware_drivers.bus import Filter
 from skinware_drivers.decoding.decoder import BUS_COUNTERS, PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, SkinTables, assemble, taxels
 from skinware_drivers.fields import Bits, DeviceTime, Flag, Identifier, SequenceNumber, StatusBytes
@@ -273,18 +273,12 @@ def test_frames_that_could_not_be_used_are_kept_for_the_bus_that_they_came_on() 
 
 
 def test_the_numbers_of_foreign_frames_are_counted_by_identifier() -> None:
-    tables = skin([Module(taxels(1))])
-    decoder = SpecifiedDecoder([one_frame(Values(0, "u1", 1))], tables)
-    batch = FrameBatch(8, 8, decoder.compiled.headroom)
-    for identifier in (0x7FF, 0, 0x7FF, 0x100):
-        batch.append(0, 1, identifier, bytes(8))
-    _, foreign = decoder.decode(batch)
-    decoder.count_unknown(batch, foreign)
-    assert decoder.state.bus_counters[0].tolist() == [3, 0, 0, 0]
-    assert {at: int(decoder.unknown_identifiers[0, at]) for at in decoder.unknown_identifiers[0].nonzero()[0]} == {
-        0: 1,
-        0x7FF: 2,
-    }
+    with decoding(one_frame(Values(0, "u1", 1)), skin([Module(taxels(1))])) as (pair, begin_ns):
+        pair.feed([(0, begin_ns, identifier, bytes(8)) for identifier in (0x7FF, 0, 0x7FF, 0x100)])
+        decoder = pair.native.decoder
+        assert decoder.state.bus_counters[0].tolist() == [3, 0, 0, 0]
+        unknown = decoder.unknown_identifiers[0]
+        assert {at: int(unknown[at]) for at in unknown.nonzero()[0]} == {0: 1, 0x7FF: 2}
 
 
 def test_all_updates_of_a_batch_are_kept_however_many_they_are() -> None:

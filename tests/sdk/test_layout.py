@@ -124,13 +124,6 @@ def test_modules_whose_cycles_are_of_other_frames_and_long(lost: int | None) -> 
     require_same(layout, decoder.tables, 1.0, 8, [(at * 100_000, *frame) for at, frame in enumerate(mixed, 1)])
 
 
-def test_a_cycle_that_takes_too_long_is_not_shown() -> None:
-    decoder = decode(fingertip(), [Module(taxels(16))], "<u2", quarters(0), gap_ns=10_000_000)
-    assert not decoder.state.updated.any()
-    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("late")] == 1
-    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 4
-
-
 @pytest.mark.parametrize(
     ("dtype", "payload", "expected"),
     [

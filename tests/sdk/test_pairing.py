@@ -337,26 +337,6 @@ def held_up(sent: Sequence[Sent], begin_ns: int, end_ns: int) -> list[Sent]:
     return [frame._replace(time_ns=frame.time_ns + number) for number, frame in enumerate(late)]
 
 
-def test_what_is_known_to_be_lost_between_two_batches_joins_nothing() -> None:
-    device = Device(2, "given", "module", 1, PERIOD_NS // 2)
-    first, second = (Sent(MS, 0, 0, 0, 0), Sent(2 * MS, 0, 1, 1, 1))
-    decoder = device.decoder
-    batch = FrameBatch(8, 8, decoder.compiled.headroom)
-    batch.append(0, first.time_ns, 0x100, bytes(8))
-    decoder.decode(batch)
-    decoder.put_back(batch)
-    batch.append(0, second.time_ns, 0x110, bytes(8))
-    updates, _ = decoder.decode(batch, interrupted=[0])
-    assert not updates.whole.any()
-    assert decoder.state.patch_counters[0, PATCH_COUNTERS.index("orphans")] == 2
-    assert not len(decoder.decode(_empty(decoder, batch))[0])
-
-
-def _empty(decoder: SpecifiedDecoder, batch: FrameBatch) -> FrameBatch:
-    decoder.put_back(batch)
-    return batch
-
-
 def test_any_order_recovers_from_one_lost_frame_at_once() -> None:
     device = Device(2, "any", "module", 1, PERIOD_NS // 4)
     sent = [frame._replace(serial=number) for number, frame in enumerate(regular(device, 6))]

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+import mmap
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from skinware import native
 from skinware.status import Status
 from skinware.tactile.baseline import Baseline, BaselineSettings, Calm
 from skinware.tactile.testing import World, grid
@@ -14,6 +19,28 @@ from tests.tactile.bench import bench_world
 
 N = 96
 _STEP_NS = 1_000_000_000
+
+
+def _before_a_guard(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Copy an array to where a page that ends the process at the first access follows it."""
+    size = -(-array.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    memory = mmap.mmap(-1, size + mmap.PAGESIZE)
+    begin = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(begin + size), ctypes.c_size_t(mmap.PAGESIZE), 0) == 0
+    copy = np.frombuffer(memory, array.dtype, array.size, size - array.nbytes).reshape(array.shape)
+    copy[...] = array
+    return copy
+
+
+@pytest.fixture(autouse=True)
+def guards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let C read and write nothing behind the arrays of a baseline."""
+
+    def give_guarded(words: Any, *how: Any) -> dict[str, npt.NDArray[Any]]:
+        arrays = native.give_arrays(words, *how)
+        return native.give_arrays(words, 0, {}, {name: _before_a_guard(array) for name, array in arrays.items()})
+
+    monkeypatch.setattr("skinware.tactile.baseline.give_arrays", give_guarded)
 
 
 class Both:

@@ -224,6 +224,11 @@ def is_whole(frame: DriverSnapshot) -> bool:
     return not (frame.status & (Status.STALE | Status.NEVER_SEEN)).any()
 
 
+def has_come(frame: DriverSnapshot) -> bool:
+    """Every sensor has had a value: it may be stale, as that of a replay that is over."""
+    return not (frame.status & Status.NEVER_SEEN).any()
+
+
 def later_than(last: DriverSnapshot) -> Callable[[DriverSnapshot], bool]:
     return lambda frame: frame.sequence > last.sequence
 

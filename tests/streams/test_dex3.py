@@ -34,7 +34,7 @@ from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import Running, refused, run, running
 from tests.ros2.alone import own_domain
-from tests.sdk.driving import follow, later_than
+from tests.sdk.driving import follow, has_come, later_than
 from tests.streams.dex3_peer import LEAST, PADS, TAXELS, Edition, pressure, temperature
 
 N = 2 * TAXELS * PADS
@@ -350,6 +350,6 @@ def test_the_commands(domain: int, tmp_path: Path) -> None:
     with running("skin-driver", "--bus", f"replay:{capture}") as replayed:
         assert replayed.wait_for("ready")["sensors"] == 2 * N
         with DriverReader("dex3") as reader:
-            frame = read_until(reader, is_good)
+            frame = read_until(reader, has_come)
             assert b"thumb tip" in frame.structure.module_name.tolist()
             assert (frame.physical("pressure") >= LEAST).all()

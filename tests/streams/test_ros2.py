@@ -39,7 +39,7 @@ from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import refused, run, running
 from tests.ros2.alone import own_domain
-from tests.sdk.driving import follow, is_whole, later_than
+from tests.sdk.driving import follow, has_come, is_whole, later_than
 from tests.streams.ros2_peer import (
     CASES,
     RAW_XELA,
@@ -473,7 +473,7 @@ def test_the_commands(domain: int, tmp_path: Path) -> None:
     with running("skin-driver", "--bus", f"replay:{capture}") as replayed:
         assert replayed.wait_for("ready")["sensors"] == 24
         with DriverReader("ros2") as reader:
-            frame = read_until(reader, is_whole)
+            frame = read_until(reader, has_come)
             assert frame.structure.geometry is not None
 
 

@@ -33,7 +33,7 @@ from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import run, running
 from tests.ros2.router import Router, router, sockets
 from tests.ros2.sdk_peer import sdk_peer
-from tests.sdk.driving import is_whole, later_than
+from tests.sdk.driving import has_come, is_whole, later_than
 from tests.streams.ros2_peer import Case, Talker, case_of, same, serialized
 
 HASH = f"RIHS01_{0:064x}"
@@ -180,7 +180,7 @@ def test_topics_are_captured_and_replayed(at: Router, tmp_path: Path) -> None:
     with running("skin-driver", "--bus", f"replay:{capture}") as replayed:
         assert replayed.wait_for("ready")["sensors"] == 8
         with DriverReader("ros2") as reader:
-            assert read_until(reader, is_whole).structure.module_name.tolist() == [b"thumb", b"sensors 1"]
+            assert read_until(reader, has_come).structure.module_name.tolist() == [b"thumb", b"sensors 1"]
 
 
 @pytest.mark.parametrize("name", ["ros2://x", "ros2://300", "ros2://0?router=nowhere", "ros2://0?qos=reliable"])

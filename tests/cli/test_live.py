@@ -92,6 +92,7 @@ def test_two_frames_at_once_right_after_a_start_make_no_rate(monkeypatch: pytest
     with FakeSkin("a", slots=8) as skin, closing(LiveDrivers(Namespace())) as drivers:
         clock_ns = now_ns()
         monkeypatch.setattr(ring, "now_ns", lambda: clock_ns)
+        skin.acquired_ns = clock_ns  # no interval of the data counts
         skin.publish()
         clock_ns += 44_000
         skin.publish()

@@ -31,7 +31,7 @@ def sums(values: Values, position: Values) -> dict[str, npt.NDArray[np.float32]]
 
 def test_its_output_is_that_of_the_newest_window() -> None:
     geometry = placed(np.column_stack([np.arange(15) * 0.01, np.zeros(15), np.zeros(15)]))
-    with DriverWriter("hand", hand().placed(geometry), rate_hz=50) as writer:
+    with DriverWriter("hand", hand().placed(geometry), rate_hz=0.1) as writer:  # samples are fresh for 30 s
         publish(writer, 1, now_ns())
         with (
             ModelService(sums, "hand", window=2) as service,

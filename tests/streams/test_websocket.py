@@ -143,7 +143,7 @@ def test_pings_that_were_answered_too_late_are_told() -> None:
         assert "answered its pings too late" in why
         assert lines(batch) == [b"only this"]
         assert connections[0].keepalive_thread is not None
-        connections[0].keepalive_thread.join(10)  # the server does not wait for it
+        connections[0].keepalive_thread.join()  # the server does not wait for it
 
 
 def test_half_a_message_is_none_and_counted() -> None:

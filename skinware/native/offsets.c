@@ -239,8 +239,8 @@ static void tick(struct baseline *b, double passed_s) {
             b->patches[number].sums[i] = 0;
     for (i = 0; i < b->n; i++) {
         struct patch *p = &b->patches[b->patch[i]];
-        const float deviation = sqrtf(b->variance[i] + b->gain[i] * b->gain[i] * (float)p->variance);
-        const float expected = (float)(1.5 * MEDIAN2) * (b->noise2[i] * share + deviation * deviation);
+        const float deviation2 = b->variance[i] + b->gain[i] * b->gain[i] * (float)p->variance;
+        const float expected = (float)(1.5 * MEDIAN2) * (b->noise2[i] * share + deviation2);
         if (!b->flag[i])
             continue;
         p->sums[NUMBER] += 1;

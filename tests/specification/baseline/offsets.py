@@ -287,7 +287,8 @@ class Offsets:
         number = np.maximum(self.patches.sum(taxels), 1)
         share = -math.expm1(-passed_s / SLOW_S)
         of_noise = np.float32(share / (2 - share))
-        expected = np.float32(1.5 * _MEDIAN) * (self.total() - self.noise2 * (1 - of_noise))
+        deviation2 = self.variance + self.gain * self.gain * self.patches.spread(self.common.variance)
+        expected = np.float32(1.5 * _MEDIAN) * (self.noise2 * of_noise + deviation2)
         beyond = self.patches.sum(taxels & (self.slow * self.slow > expected)) / number
         typical = self.patches.median(self.noise2, taxels).astype(np.float64)
         some = self.patches.sum(taxels) > 0

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
-from skinware import DriverReader, DriverSnapshot
+from skinware import DriverReader, DriverSnapshot, Status
 from skinware_drivers.modbus.adapter import ModbusAdapter
 from skinware_drivers.modbus.dfrobot import DfrobotDriver, DfrobotOptions
 from skinware_drivers.modbus.inspire import InspireDriver, InspireOptions
@@ -97,13 +97,13 @@ def hand(request: pytest.FixtureRequest) -> Hand:
 
 
 def until_right(reader: DriverReader, hand: Hand) -> None:
-    """A frame that was read from now on."""
+    """A frame that was read from now on, however long another program took for all of it."""
     now_ns = time.monotonic_ns()
     read_until(
         reader,
         lambda frame: (
             bool((frame.module_time_ns > now_ns).all())
-            and not frame.status.any()
+            and not (frame.status & ~np.uint8(Status.STALE)).any()
             and np.array_equal(frame.values, hand.right)
         ),
     )

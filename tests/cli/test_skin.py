@@ -12,7 +12,7 @@ import pytest
 
 from skinware.cli._command import exit_status
 from skinware_drivers.cli import skin
-from tests.commands import BIN, refused
+from tests.commands import BIN, run
 
 PROJECT = Path(__file__).parents[2]
 
@@ -40,7 +40,7 @@ def test_an_unknown_command_is_an_error_with_the_nearest_one(capsys: pytest.Capt
 
 @pytest.mark.thorough
 def test_a_command_runs_as_by_its_own_name() -> None:
-    joined, alone = refused("skin", "info", "--json"), refused("skin-info", "--json")
+    joined, alone = run("skin", "info", "--json"), run("skin-info", "--json")
     assert (joined.returncode, joined.stderr) == (alone.returncode, alone.stderr)
     assert json.loads(joined.stdout).keys() == json.loads(alone.stdout).keys()
     wrong = subprocess.run([BIN / "skin", "info", "--jsn"], capture_output=True, text=True)

@@ -295,6 +295,9 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
     except OSError as error:
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
         where = f"{error.filename}: " if error.filename else "its output cannot be written: " if is_full else ""
+        folder = os.path.dirname(error.filename or "")
+        if error.errno == errno.ENOENT and folder and not os.path.exists(folder):
+            where, error = "", FileNotFoundError(f"there is no folder {folder}")
         echo(f"{name}: {where}{error.strerror or error}", err=True)
         _discard_output()
         return EXIT_USAGE if isinstance(error, FileNotFoundError | FileExistsError) else EXIT_FAILED

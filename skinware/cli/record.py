@@ -221,7 +221,7 @@ class _Progress:
                 print_json({"event": "stopped", **ends, **self._figures(messages)})
             return
         for name, count in messages.items():
-            echo(f"{name}: {count} messages")
+            echo(f"{name}: {plural(count, 'message')}")
         count = self._recorder.missed
         missed = f", {plural(count, 'sample')} missed" if count else ", nothing missed" * is_complete
         ended = "complete" if is_complete else "ended early"

@@ -35,9 +35,9 @@ def command(file: Path, output: Path | None, as_json: bool) -> None:
         print_json({"event": "recovered", "file": str(target), **asdict(recovered)})
         return
     for channel, count in recovered.messages.items():
-        echo(f"{channel}: {count} messages")
-    damage = f"{plural(recovered.damaged, 'damaged chunk')} left out" if recovered.damaged else "it was cut off"
-    what = "it was whole" if recovered.was_whole else damage
+        echo(f"{channel}: {plural(count, 'message')}")
+    damage = f"{plural(recovered.damaged, 'damaged chunk')} left out" if recovered.damaged else f"{file} was cut off"
+    what = f"{file} was whole" if recovered.was_whole else damage
     echo(f"{target}: written; {what}")
 
 

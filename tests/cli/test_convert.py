@@ -60,7 +60,7 @@ def test_for_people_and_programs(file: Path, tmp_path: Path, capsys: pytest.Capt
         (["nothing.mcap", "--to", "npz"], 2, "nothing.mcap: No such file or directory"),
         (["walk.mcap", "--to", "xls"], 2, "'xls' is not one of"),
         (["walk.mcap", "--to", "npz", "-o", "walk.mcap"], 2, "walk.mcap: exists already: give another name"),
-        (["walk.mcap", "--to", "npz", "-o", "nowhere/x.npz"], 2, "No such file or directory"),
+        (["walk.mcap", "--to", "npz", "-o", "nowhere/x.npz"], 2, "skin-convert: there is no folder nowhere"),
         (["walk.mcap", "--to", "npz", "-o", "/proc/x.npz"], 2, "No such file or directory"),
         (["walk.mcap", "--to", "npz", "--start", "2", "--end", "1"], 2, "--end 1 is not after --start 2"),
         (["walk.mcap", "leg", "--to", "npz"], 2, "no service 'leg'; there are: torso"),

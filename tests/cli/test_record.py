@@ -98,9 +98,9 @@ def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) * 2 // 3])
     assert exit_status(recover, ["cut.mcap"]) == 0
-    assert capsys.readouterr().out.endswith("cut.recovered.mcap: written; it was cut off\n")
+    assert capsys.readouterr().out.endswith("cut.recovered.mcap: written; cut.mcap was cut off\n")
     assert exit_status(recover, [file.name, "-o", "again.mcap"]) == 0
-    assert capsys.readouterr().out.endswith("again.mcap: written; it was whole\n")
+    assert capsys.readouterr().out.endswith(f"again.mcap: written; {file.name} was whole\n")
 
 
 @pytest.mark.thorough
@@ -186,7 +186,7 @@ def test_no_permission_is_one_line(tmp_path: Path) -> None:
     ("arguments", "code", "words"),
     [
         (["-o", "there.mcap"], 2, "there.mcap: exists already: give another name, or remove it"),
-        (["-o", "nowhere/x.mcap"], 2, "nowhere/x.mcap: No such file or directory"),
+        (["-o", "nowhere/x.mcap"], 2, "skin-record: there is no folder nowhere"),
         (["-o", "/proc/x.mcap"], 2, "/proc/x.mcap: No such file or directory"),
         (["-o", "x.mcap", "to rso"], 2, "service name 'to rso'"),
         (["x.mcap", "-o", "y.mcap"], 2, "one file is written, and 2 are given: y.mcap, x.mcap"),

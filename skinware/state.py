@@ -193,14 +193,10 @@ def report_of(
         )
         for name, state, reason, load, counters in zip(structure.buses, *columns, strict=True)
     )
-    sensors, fresh, dark, waiting = (
-        np.bincount(patches, minlength=structure.n_patches).tolist()
-        for patches in (
-            structure.sensor_patch,
-            structure.sensor_patch[status == 0],
-            structure.sensor_patch[is_untouched],
-            structure.sensor_patch[is_settling],
-        )
+    none = [0] * structure.n_patches
+    fresh, dark, waiting = (
+        np.bincount(structure.sensor_patch[chosen], minlength=structure.n_patches).tolist() if chosen.any() else none
+        for chosen in (status == 0, is_untouched, is_settling)
     )
     rates = patch_rates_hz if len(patch_rates_hz) == structure.n_patches else [None] * structure.n_patches
     ages_ns, patch_buses, states = patch_ages_ns(frame), structure.patch_bus.tolist(), frame.patch_state.tolist()
@@ -209,7 +205,7 @@ def report_of(
             name=structure.patch_names[patch],
             bus=patch_buses[patch],
             state=state_name(PatchState, states[patch]),
-            sensors=sensors[patch],
+            sensors=len(structure.patch_index(patch)),
             fresh=fresh[patch],
             untouched=dark[patch],
             settling=waiting[patch],

@@ -56,6 +56,7 @@ class DriverRest:
         self.baseline: Floats = np.full(n, np.nan, np.float32)
         self._age_s = np.zeros(n, np.float32)
         self._unrest = np.zeros(n, np.float32)
+        self._is_settling = n > 0
         self._time_ns: int | None = None
         self._every_ns = 0
 
@@ -76,18 +77,21 @@ class DriverRest:
         passed_s = 0.0 if self._time_ns is None else min(1.0, max(0, time_ns - self._time_ns) / 1e9)
         self._time_ns = time_ns
         counts = fresh & np.isfinite(physical)
-        self.baseline = np.where(counts & np.isnan(self.baseline), physical, self.baseline)
+        if self._is_settling:
+            self.baseline = np.where(counts & np.isnan(self.baseline), physical, self.baseline)
         change = np.where(counts, physical - self.baseline, np.float32(0))
-        settling = self._age_s < SETTLING_S
-        np.maximum(self._unrest, np.where(settling, np.abs(change), 0), out=self._unrest)
-        falls, drifts = (np.float32(-np.expm1(-passed_s / duration_s)) for duration_s in (_FALL_S, _DRIFT_S))
+        falls, drifts = (np.float32(-math.expm1(-passed_s / duration_s)) for duration_s in (_FALL_S, _DRIFT_S))
         share = np.where((change < 0) & self._grows, falls, drifts)
-        self._age_s += np.float32(passed_s) * counts
-        if settling.any():
+        self._every_ns = _FOLLOW_EVERY_NS
+        if self._is_settling:
+            settling = self._age_s < SETTLING_S
+            np.maximum(self._unrest, np.where(settling, np.abs(change), 0), out=self._unrest)
+            self._age_s += np.float32(passed_s) * counts
             first = np.float32(passed_s) / np.maximum(self._age_s + np.float32(passed_s), np.float32(1e-9))
             share = np.where(settling, first, share)
+            self._every_ns *= not (settling & counts).any()
+            self._is_settling = bool(settling.any())
         self.baseline += change * share
-        self._every_ns = 0 if (settling & counts).any() else _FOLLOW_EVERY_NS
 
     def change(self, physical: Floats) -> Floats:
         """Return (n,) float32, 0 or more: distance of values from the baseline, up or down; 0 without a baseline."""
@@ -96,7 +100,7 @@ class DriverRest:
 
     def noise(self, type_name: str) -> float:
         """Return the noise of a type: half of its sensors moved less in their first second; at least one count."""
-        unrest = self._unrest[self._structure.index(type_name)]
+        unrest = self._unrest[self._structure.span(type_name)]
         count = abs(self._structure.type(type_name).scale) if self._structure.dtype.kind != "f" else 0.0
         return max(float(np.median(unrest)), count)
 

@@ -38,7 +38,7 @@ from skinware.tactile.source_service import SourceReader
 from skinware.text import nearest_name
 
 _RATE_WINDOW_NS = 2 * NS_PER_S
-_COUNT_EVERY_NS = NS_PER_S // 10
+_COUNT_EVERY_NS = NS_PER_S // 5
 _WAIT_S = 0.1
 _SILENT_S = 5.0
 _MOST_BETWEEN = 64

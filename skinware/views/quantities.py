@@ -155,7 +155,7 @@ def quantities_of(structure: Structure) -> tuple[Quantity, ...]:
     positions, pads = np.arange(structure.n_sensors), pads_of(structure)
     found = []
     for name in shown:
-        where = structure.index(name)
+        where = structure.span(name)
         uid = structure.sensor_uid[where]
         geometry = structure.geometry
         found.append(
@@ -295,7 +295,7 @@ class Newest:
 
     @cached_property
     def is_good(self) -> bool:
-        return not self.status.any()
+        return not np.count_nonzero(self.status)
 
     @property
     def contacts_position(self) -> tuple[int, int] | None:
@@ -314,8 +314,8 @@ class Newest:
     @cached_property
     def marked(self) -> npt.NDArray[np.uint8]:
         """(n_sensors,) uint8: ``status``, but all bits for sensors that were seen, and wait for their baselines."""
-        is_unseen = (self.status & _NEVER_SEEN) != 0
-        return self.status if self.is_good else np.where(self.settling & is_unseen, _ALL_BITS, self.status)
+        status = self.status
+        return status if self.is_good else np.where(self.settling & ((status & _NEVER_SEEN) != 0), _ALL_BITS, status)
 
     @property
     def all(self) -> Sequence[DriverSnapshot]:

@@ -26,7 +26,7 @@ export class Bar {
       const fresh = figures.fresh === undefined ? null : `${count(figures.fresh)}/${count(figures.sensors)} fresh`;
       const parts = [state, ...figuresOf({ report: figures }), fresh, `dropped ${count(figures.dropped)}`];
       if (figures.load !== undefined && figures.load !== null) parts.push(`load ${percent(figures.load)}`);
-      setText(chip.lastChild, parts.filter(Boolean).join(" · "));
+      setText(chip.lastChild, parts.filter(Boolean).map((part) => part.replaceAll(" ", "\u00a0")).join(" · "));
     }
     const drawing = `${stage.fps.toFixed(0)} pictures/s`;
     setText(this.own, stage.isSolid ? drawing : `${drawing}, without WebGL`);

@@ -15,14 +15,7 @@ from skinware._columns import Index
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.geometry import Geometry
 from skinware.nominal_hand import PARTS, NominalHand
-from skinware.sensor_types import (
-    FORCE_Z,
-    NOT_TOUCH,
-    PRESSURE,
-    SHEAR_X,
-    SHEAR_Y,
-    SensorType,
-)
+from skinware.sensor_types import FORCE_Z, NOT_TOUCH, PRESSURE, SHEAR_X, SHEAR_Y, SensorType
 from skinware.state import settling
 from skinware.status import Status
 from skinware.structure import Structure

@@ -156,17 +156,20 @@ class ConverterBoard:
 
     async def describe(self, link: Link) -> Sequence[Patch]:
         """Ask for the sensors; each is a patch."""
-        found: dict[int, str] = {}
-        for sensor in self._wanted or SENSORS:
-            try:
-                found[sensor] = await ask_version(link, sensor, tries=_TRIES if self._wanted else 1)
-            except HandshakeTimeout:
-                if self._wanted:
-                    raise
+        sensors = self._wanted or SENSORS
+        with link.follow(*(answer(sensor, _READ, _VERSION) for sensor in sensors)) as replies:
+            for sensor in sensors:
+                try:
+                    await ask_version(link, sensor, tries=_TRIES if self._wanted else 1)
+                except HandshakeTimeout:
+                    if self._wanted:
+                        raise
+            came = [replies.get_nowait() for _ in range(replies.qsize())]  # also those that were late
+        found = {reply.identifier & _SENSOR_MASK: version_in(reply.payload) for reply in came}
         if not found:
             raise HandshakeTimeout(f"{link.bus_name}: no sensor answers, from id {SENSORS[0]} to {SENSORS[-1]}")
         points = {}
-        for sensor, version in found.items():
+        for sensor, version in sorted(found.items()):
             by_code = (count for code, count in POINTS_OF_PART.items() if code in version)
             points[sensor] = self._points or next(by_code, 0)
             if not points[sensor]:

@@ -206,6 +206,25 @@ def test_a_converter_board_is_found_and_its_sensors_are_set_to_zero() -> None:
         assert is_fresh(frame)
 
 
+class Slow(EmulatedPaxini):
+    """The version of sensor 3 comes with that of sensor 8."""
+
+    late = b""
+
+    def answer(self, device: Device, command: bytes, now_ns: int) -> bytes | None:
+        reply = super().answer(device, command, now_ns)
+        if command == VERSION_OF_3 and device.number == 3:
+            Slow.late = reply or b""
+            return None
+        return Slow.late + reply if reply and device.number == 8 and command[7:9] == VERSION_OF_3[7:9] else reply
+
+
+def test_a_sensor_that_answers_when_others_are_asked_is_found() -> None:
+    with emulated_skin(PaxiniDriver, Slow, sensors=(3, 8)) as skin:
+        structure = read_until(skin.reader, is_live).structure
+        assert structure.patch_name.tolist() == [b"sensor 3", b"sensor 8"]
+
+
 class Refusing(EmulatedPaxini):
     """Answers with errors once ``refuses`` is set."""
 

@@ -20,6 +20,7 @@ import click
 
 from skinware.cli import _command as cli
 from skinware.cli._terminal import are_terminals, echo, enter_pressed, print_json
+from skinware.errors import ServiceNotFound
 from skinware.text import plural
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def command(
     the last 0.3 s is in the file, and skin-recover repairs it. If the file is deleted, moved or changed meanwhile, the
     recording ends within a second with status 1.
 
-    Exit status: 0 ended or interrupted, 1 failed, 2 wrong usage.
+    Exit status: 0 ended or interrupted, 1 failed or nothing of NAME, 2 wrong usage.
     """
     from skinware.conversion.showing import Viewers
     from skinware.memory.namespace import Namespace, check_name
@@ -213,12 +214,17 @@ class _Progress:
         self._news()
         messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
         absent = [name for name in self._names if not any(channel.split("/")[2:3] == [name] for channel in messages)]
-        if absent and not self._is_past:
-            cli.warn(f"{', '.join(absent)} did not appear in namespace {self._namespace!r}")
+        why = f"{', '.join(absent)} did not appear in namespace {self._namespace!r}"
+        is_empty = is_complete and not self._is_past and len(absent) == len(self._names) > 0
+        if absent and not self._is_past and not is_empty:
+            cli.warn(why)
         if self._as_json:
             with contextlib.suppress(BrokenPipeError):
                 ends = {"file": (files or [""])[-1], "files": files, "is_complete": is_complete}
                 print_json({"event": "stopped", **ends, **self._figures(messages)})
+        if is_empty:
+            raise ServiceNotFound(why)
+        if self._as_json:
             return
         for name, count in messages.items():
             echo(f"{name}: {plural(count, 'message')}")

@@ -103,6 +103,17 @@ def test_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypa
     assert capsys.readouterr().out.endswith(f"again.mcap: written; {file.name} was whole\n")
 
 
+@pytest.mark.parametrize("as_json", [False, True])
+def test_a_recording_of_nothing_has_failed(tmp_path: Path, capsys: pytest.CaptureFixture[str], as_json: bool) -> None:
+    arguments = ["tosro", "-T", "0.2", "-o", str(tmp_path / "walk.mcap"), *(["--json"] * as_json)]
+    with publishing(FakeSkin("torso")):
+        assert exit_status(record, arguments) == 1
+    out, err = capsys.readouterr()
+    assert err.endswith(f"skin-record: tosro did not appear in namespace '{Namespace().name}'\n")
+    assert "complete," not in out
+    assert ('"event":"stopped"' in out) == as_json
+
+
 @pytest.mark.thorough
 def test_a_signal_saves_the_past(tmp_path: Path) -> None:
     file = tmp_path / "fall.mcap"

@@ -69,7 +69,7 @@ class Shown:
 
 PICTURES = {
     "view": Shown(("arm", "hand"), f"theme=dark&{BOTH}", contacts(200, 3), pins=(124, 200)),
-    "view-light": Shown(("hand",), "theme=light", contacts(2000, 2)),
+    "view-light": Shown(("hand",), "theme=light", contacts(2000, 1)),
     "view-phone": Shown(("hand",), "theme=dark", contacts(2000, 1), PHONE),
     "view-contacts": Shown(("arm",), f"theme=light&{EYE}", f"{FRESH} && {contacts(300, 2)}"),
     "view-problem": Shown(("broken",), f"theme=dark&{EYE}", "skin.problems.length >= 3", calm=False),

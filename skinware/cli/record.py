@@ -112,7 +112,7 @@ def command(
     the last 0.3 s is in the file, and skin-recover repairs it. If the file is deleted, moved or changed meanwhile, the
     recording ends within a second with status 1.
 
-    Exit status: 0 ended or interrupted, 1 failed or nothing of NAME, 2 wrong usage.
+    Exit status: 0 ended or interrupted, 1 failed or no NAME appeared, 2 wrong usage.
     """
     from skinware.conversion.showing import Viewers
     from skinware.memory.namespace import Namespace, check_name

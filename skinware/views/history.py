@@ -89,7 +89,7 @@ class DriverRest:
             self._age_s += np.float32(passed_s) * counts
             first = np.float32(passed_s) / np.maximum(self._age_s + np.float32(passed_s), np.float32(1e-9))
             share = np.where(settling, first, share)
-            self._every_ns *= not (settling & counts).any()
+            self._every_ns = 0 if (settling & counts).any() else _FOLLOW_EVERY_NS
             self._is_settling = bool(settling.any())
         self.baseline += change * share
 

@@ -165,11 +165,11 @@ class ConverterBoard:
                     if self._wanted:
                         raise
             came = [replies.get_nowait() for _ in range(replies.qsize())]  # also those that were late
-        found = {reply.identifier & _SENSOR_MASK: version_in(reply.payload) for reply in came}
+        found = dict(sorted((reply.identifier & _SENSOR_MASK, version_in(reply.payload)) for reply in came))
         if not found:
             raise HandshakeTimeout(f"{link.bus_name}: no sensor answers, from id {SENSORS[0]} to {SENSORS[-1]}")
         points = {}
-        for sensor, version in sorted(found.items()):
+        for sensor, version in found.items():
             by_code = (count for code, count in POINTS_OF_PART.items() if code in version)
             points[sensor] = self._points or next(by_code, 0)
             if not points[sensor]:

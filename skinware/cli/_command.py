@@ -15,7 +15,9 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
@@ -222,8 +224,31 @@ def ending_signals() -> list[signal.Signals]:
 def signals_end(
     stop: Callable[[], object], others: Mapping[signal.Signals, Callable[[], object]] | None = None
 ) -> Iterator[None]:
-    """Let the ending signals call ``stop`` in the main thread, which ends the block; and other signals other things."""
+    """Let the ending signals call ``stop``, which ends the block; and other signals other things.
+
+    They are called one after the other in a thread. A handler of signals runs between any two steps of the main thread,
+    so it must not take a lock that this thread may hold, and :meth:`threading.Event.set` takes one.
+    """
     calls = {**dict.fromkeys(ending_signals(), stop), **(others or {})}
+    due: SimpleQueue[Callable[[], object] | None] = SimpleQueue()  # its put may interrupt its put
+
+    def call_all() -> None:
+        for call in iter(due.get, None):
+            call()
+
+    caller = threading.Thread(target=call_all, daemon=True)
+    caller.start()
+    with signals_call({number: partial(due.put, call) for number, call in calls.items()}):
+        try:
+            yield
+        finally:
+            due.put(None)
+            caller.join()
+
+
+@contextlib.contextmanager
+def signals_call(calls: Mapping[signal.Signals, Callable[[], object]]) -> Iterator[None]:
+    """Call functions in the main thread, where they may raise, when signals come while the block runs."""
     before = {number: signal.signal(number, lambda *_, call=call: call()) for number, call in calls.items()}
     try:
         yield
@@ -245,6 +270,8 @@ def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     sys.unraisablehook = _interrupt_again
     with patient_output() if goes_on else contextlib.nullcontext():
         status = exit_status(command, sys.argv[1:])
+    for number in ending_signals():
+        signal.signal(number, signal.SIG_DFL)  # no traceback of the interpreter's own end
     sys.exit(status)
 
 

@@ -195,7 +195,7 @@ class Recorder:
         self._stopping = True
 
     def save(self) -> None:
-        """Write the chunks in memory (:class:`skinware.recording.files.Past`); from any thread or signal handler."""
+        """Write the chunks in memory (:class:`skinware.recording.files.Past`); from any thread."""
         self._coder.jobs.put(self._coder.save)
 
     def mark(self, text: str, time_ns: int) -> None:

@@ -190,7 +190,7 @@ def _interrupted_once() -> Iterator[Callable[[], None]]:
         undisturbed()
         raise KeyboardInterrupt
 
-    with cli.signals_end(interrupt):
+    with cli.signals_call(dict.fromkeys(numbers, interrupt)):
         yield undisturbed
 
 

@@ -2,13 +2,17 @@ from __future__ import annotations
 
 import errno
 import json
+import queue
+import signal
+import threading
 
 import click
 import pytest
 
-from skinware.cli._command import examples, exit_status, seconds, warn
+from skinware.cli._command import examples, exit_status, seconds, signals_end, warn
 from skinware.cli._terminal import print_json
 from skinware.errors import BadServiceFile, BusNotAvailable, BusSendError, ConfigurationError, ServiceNotFound
+from tests.commands import PATIENCE_S
 
 
 def command_that(raises: BaseException | None = None) -> click.Command:
@@ -108,3 +112,15 @@ def test_warnings_name_the_command(capsys: pytest.CaptureFixture[str]) -> None:
     with click.Context(command_that(), info_name="skin-try"):
         warn("it came back")
     assert capsys.readouterr() == ("", "skin-try: it came back\n")
+
+
+def test_a_signal_that_interrupts_the_holder_of_a_lock_ends_the_command() -> None:
+    lock, taken = threading.Lock(), queue.SimpleQueue[bool]()
+
+    def stop() -> None:  # as that of an Event, which the main thread may be about to wait for
+        taken.put(lock.acquire(timeout=1))
+
+    with signals_end(stop):
+        with lock:
+            signal.raise_signal(signal.SIGTERM)
+        assert taken.get(timeout=PATIENCE_S)

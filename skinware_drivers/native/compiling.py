@@ -26,18 +26,20 @@ _SENTINEL, _ABOVE, _STATUS_BYTES, _WORD = range(4)
 
 def check_values(frame: Frame) -> None:
     """Refuse values that the data path cannot read together."""
-    dtypes = [np.dtype(np.int64 if isinstance(run.dtype, Packed) else run.dtype) for run in frame.runs]
-    kinds = {"float" if dtype.kind == "f" else "integer" for dtype in dtypes}
+    dtypes = [np.dtype(run.dtype) for run in frame.runs if not isinstance(run.dtype, Packed)]
     unknown = next((dtype for dtype in dtypes if dtype.str[1:] not in _TYPES), None)
     if unknown is not None:
         problem = f"values of dtype {unknown.name}"
-    elif len(kinds) > 1:
-        problem = "integers beside floats"
-    elif kinds == {"integer"} and np.result_type(*dtypes).kind == "f":
-        problem = "64-bit values with and without a sign"
+    elif any(dtype.str[1:] in ("u8", "i8") for dtype in dtypes) and _common_dtype(frame).kind == "f":
+        problem = "64-bit integers beside floats or integers of another sign"
     else:
         return
     raise ConfigurationError(f"frame {frame.name!r}: {problem} cannot be declared; read them with an Expand function")
+
+
+def _common_dtype(frame: Frame) -> np.dtype[Any]:
+    """Return the dtype in which the values of all runs are compared with sentinels and limits."""
+    return np.result_type(*(np.int64 if isinstance(run.dtype, Packed) else run.dtype for run in frame.runs))
 
 
 def compile_decoder(decoder: Decoder, plan: structs.Plan, arrays: structs.Arrays) -> None:
@@ -172,10 +174,7 @@ def _kind(compiled: FrameKind, decoder: Decoder, arrays: structs.Arrays) -> stru
             runs.append(structs.Run(run.offset, run.count, *_type(run.dtype), column))
         column += run.count
     kind.n_runs, kind.runs = arrays.structs(structs.Run, runs)
-    values = decoder.tables.structure.dtype
-    if frame.runs:
-        dtypes = (np.int64 if isinstance(run.dtype, Packed) else np.dtype(run.dtype) for run in frame.runs)
-        values = np.result_type(*dtypes)
+    values = _common_dtype(frame) if frame.runs else decoder.tables.structure.dtype
     kind.n_flags, kind.flags = arrays.structs(
         structs.Flag, (_flag(flag, values, decoder.tables, arrays) for flag in frame.flags)
     )
@@ -211,7 +210,7 @@ def _compared(form: int, status: Status, number: float, values: np.dtype[Any]) -
     found = structs.Flag(form=form, status=int(status))
     number = number.item() if isinstance(number, np.generic) else number
     if values.kind == "f":
-        found.real = float(values.type(number))
+        found.is_float, found.real = True, float(values.type(number))
     elif isinstance(number, float):
         found.is_float, found.real = True, number
     elif not np.iinfo(values).min <= number <= np.iinfo(values).max:

@@ -113,17 +113,14 @@ _EXPANDS = [Expand(nibbles), Expand(run_lengths), Expand(greedy)]
 def _runs(draw: st.DrawFn, dtype: str, shortest: int, channels: Sequence[int]) -> Sequence[Values]:
     """Runs of values, none of which ends behind the shortest payload; each channel comes as often as it likes."""
     limits = np.iinfo(dtype) if dtype != "<f4" else None
-    real = dtype == "<f4" and draw(st.booleans())
-    plain = [
-        name
-        for name in (_REAL if real else _WHOLE)
-        if limits is None or (limits.min <= np.iinfo(name).min and np.iinfo(name).max <= limits.max)
-    ]
+    plain = _WHOLE + _REAL
+    if limits is not None:
+        plain = [n for n in _WHOLE if limits.min <= np.iinfo(n).min and np.iinfo(n).max <= limits.max]
     most_bits = 32 if limits is None else int(limits.max).bit_length()
     runs = []
     for _ in range(draw(st.sampled_from([1, 1, 2, 3]))):
         kind: str | Packed = draw(st.sampled_from(plain))
-        if not real and draw(st.integers(0, 3)) == 3:
+        if draw(st.integers(0, 3)) == 3:
             is_signed = bool(limits is None or limits.min < 0) and draw(st.booleans())
             bits = draw(st.integers(1, most_bits + is_signed if most_bits < 32 else 32))
             kind = Packed(bits, draw(st.sampled_from(["big", "little"])), is_signed, draw(st.integers(0, 7)))

@@ -19,6 +19,7 @@ from skinware_drivers.decoding.decoder import PATCH_COUNTERS
 from skinware_drivers.description import Module, Patch, assemble, taxels
 from skinware_drivers.fields import Above, Bits, Byte, Flag, Identifier, Packed, Sentinel, SequenceNumber, StatusBytes
 from skinware_drivers.layout import Cycle, Expand, Frame, Layout, Values
+from skinware_drivers.native.compiling import check_values
 from tests.specification.both_paths import Pair, hand_clock, require_same
 from tests.specification.decoding import SpecifiedDecoder
 
@@ -133,22 +134,13 @@ def test_modules_whose_cycles_are_of_other_frames_and_long(lost: int | None) -> 
         (Packed(12, order="little"), "bc3a12ff0f000000", [0xABC, 0x123, 0xFFF, 0x000]),
         (Packed(12, signed=True), "8007ffffF0000000", [-2048, 2047, -1, 0]),
         (Packed(1), "a000000000000000", [1, 0, 1, 0]),
-    ],
-)
-def test_values_at_their_extremes(dtype: str | Packed, payload: str, expected: list[int]) -> None:
-    decoder = decode(one(Values(0, dtype, 4)), [Module(taxels(4))], "<i4", [(0x100, bytes.fromhex(payload))])
-    assert decoder.state.values.tolist() == expected
-
-
-@pytest.mark.parametrize(
-    ("packed", "payload", "expected"),
-    [
         (Packed(12, skip=4), "3abc123def456789", [0xABC, 0x123, 0xDEF, 0x456, 0x789]),
         (Packed(3, order="little", skip=2), "a4d1000000000000", [1, 5, 1, 2, 3]),
     ],
 )
-def test_values_that_begin_within_a_byte(packed: Packed, payload: str, expected: list[int]) -> None:
-    decoder = decode(one(Values(0, packed, 5)), [Module(taxels(5))], "<u2", [(0x100, bytes.fromhex(payload))])
+def test_values_at_their_extremes(dtype: str | Packed, payload: str, expected: list[int]) -> None:
+    n = len(expected)
+    decoder = decode(one(Values(0, dtype, n)), [Module(taxels(n))], "<i4", [(0x100, bytes.fromhex(payload))])
     assert decoder.state.values.tolist() == expected
 
 
@@ -159,6 +151,23 @@ def test_several_runs_of_values_in_one_frame() -> None:
     decoder = decode(layout, [Module(taxels(4))], "<i4", [(0x100, frame)])
     assert decoder.state.values.tolist() == [7, 8, 0x102, -2]
     assert decoder.state.status.tolist() == [0] * 4
+
+
+def test_integers_beside_floats_are_compared_as_numbers() -> None:
+    runs = Values(0, "<f4", 2, to=(3, 0)), Values(8, "u1", 2, to=(2, 1)), Values(10, Packed(4), 2, to=(4, 5))
+    flags = [Sentinel(Status.MASKED, 7), Above(Status.SUSPECT, 99.5), Sentinel(Status.NO_ACK, float("nan"))]
+    payload = np.array([7, np.nan], "<f4").tobytes() + bytes([100, 7, 0x78])
+    decoder = decode(one(runs, 11, flags=flags), [Module(taxels(6))], "<f4", [(0x100, payload)])
+    assert decoder.state.values[1:].tolist() == [7, 100, 7, 7, 8]
+    nan, seven, above = Status.NO_ACK, Status.MASKED, Status.SUSPECT
+    assert decoder.state.status.tolist() == [nan, seven, above, seven, seven, 0]
+
+
+@pytest.mark.parametrize("dtypes", [("<f2",), ("<f4", "u8"), (">i8", "u8"), (Packed(3), "uint64")])
+def test_values_that_cannot_be_read_exactly_are_refused(dtypes: Sequence[str | Packed]) -> None:
+    [frame] = one([Values(0, dtype, 1) for dtype in dtypes]).frames
+    with pytest.raises(ConfigurationError, match=r"frame 'data': .* cannot be declared; read them with an Expand"):
+        check_values(frame)
 
 
 def test_frames_of_one_patch_and_one_module_alone() -> None:
@@ -483,10 +492,7 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (lambda: Layout([]), "1 to 200 frames"),
         (lambda: Layout(fingertip().frames, Cycle(["q0", "q9"], 1.0)), "at least two different frames"),
         (lambda: Layout(rows(1, 3)[0], rows(1, 3)[1], [rows(1, 3)[1]]), "are members of two cycles"),
-        (
-            lambda: Layout(rows(1, 129)[0], rows(1, 129)[1]),
-            "cycle of 129 frames: in the order 'given' give at most 128",
-        ),
+        (lambda: Layout(rows(1, 129)[0], rows(1, 129)[1]), "of 129 frames: in the order 'given' give at most 128"),
         (lambda: Layout(rows(1, 33)[0], replace(rows(1, 33)[1], order="any")), "in the order 'any' give at most 32"),
         (lambda: one(Values(0, "u1", 1), patch=Bits(0, 4, byte=0)), "a patch is named by bits of the identifier"),
         (lambda: one(Values(0, "u1", 1), sequence=SequenceNumber(7, "<u2")), "sequence number is not in every"),
@@ -495,10 +501,7 @@ def test_a_frame_without_conditions_is_every_frame_of_the_bus() -> None:
         (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", mask=0x100)]), "bits of an unsigned word"),
         (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", each=[(0, 8)])]), "bits of an unsigned"),
         (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "<i2", mask=1)]), "unsigned word, not of '<i2'"),
-        (
-            lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", 1, normal=256)]),
-            "bits of an unsigned word",
-        ),
+        (lambda: one(Values(0, "u1", 1), flags=[Flag(Status.NO_ACK, 0, "u1", 1, normal=256)]), "bits of an unsigned"),
         (lambda: one((), flags=[Flag(Status.NO_ACK, 0, "u1", each_module=[(0, 8)])]), "bits of an unsigned word"),
         (lambda: one((), flags=[Flag(Status.NO_ACK, 0, "u1", each_module=[(0, 1), (0, 2)])]), "there are several"),
         (

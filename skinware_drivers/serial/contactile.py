@@ -187,12 +187,13 @@ class PapillArrayDriver(SerialAdapter[PapillArrayOptions]):
         frames, modules, places = list[Frame](), list[Module](), list[Geometry]()
         for key, size in sorted(self._heard.items(), key=lambda item: (item[0] >> 4, item[0] & 0xF)):
             sensor, block = key >> 4, BLOCKS[key & 0xF]
-            count = (size - STAMP_SIZE) // (4 * len(block.types))
+            count = (size - STAMP_SIZE) // block.size
             uids = [sensor << 8 | pillar for pillar in range(count)] if block.of_pillars else [sensor << 8 | _WHOLE]
             states, others = block.types[: block.states], block.types[block.states :]
             channels = [Sensor(kind.name, uid) for part in (states, others) for uid in uids for kind in part]
             name = f"sensor {sensor} {block.name}"
-            frames.append(_frame(name, key, len(channels), counted=block.name == "pillars"))
+            n_states = len(states) * len(uids)
+            frames.append(_frame(name, key, n_states, len(channels), counted=block.name == "pillars"))
             modules.append(Module(channels, key, block.name, name))
             if block.name == "pillars":
                 side = math.isqrt(count)
@@ -248,13 +249,14 @@ class PapillArrayDriver(SerialAdapter[PapillArrayOptions]):
         return sizes_of(frame.payload) if frame.identifier == NEWS else heard
 
 
-def _frame(name: str, key: int, count: int, *, counted: bool) -> Frame:
-    values = Values(STAMP_SIZE, "<f4", count)
+def _frame(name: str, key: int, n_states: int, n_channels: int, *, counted: bool) -> Frame:
+    states = Values(STAMP_SIZE, "i1", n_states)
+    others = Values(states.end, "<f4", n_channels - n_states, range(n_states, n_channels))
     return Frame(
         name,
         [Identifier(key)],
-        [values.end],
-        values,
+        [others.end],
+        [states, others],
         module=key,
         flags=NO_NUMBER,
         sequence=SequenceNumber(0, "<u4") if counted else None,

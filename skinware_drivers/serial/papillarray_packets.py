@@ -16,7 +16,7 @@ Data: the size of a position u8; type u16 and position of each block, up to the 
 * 6: as 4, for each sensor 1 u16, detection u8, friction and target grip force in N f32.
 
 All positions count from the beginning of the data, also within blocks: the maker's library misreads others. Blocks of
-other types are skipped. Each block becomes a frame for each sensor: number of the packet, low half of the time, values.
+other types are skipped. Each block becomes a frame for each sensor: the packet's number, low half of the time, i8, f32.
 """
 
 from __future__ import annotations
@@ -96,26 +96,11 @@ class PapillArrayPackets(ReceivedFraming):
 
 
 class _Cut(NamedTuple):
-    """A frame among the bytes of all: ``states`` bytes from ``begin`` on are small numbers, which become f32."""
+    """A frame among the bytes of all."""
 
     identifier: int
     begin: int
-    states: int
     stop: int
-
-    @property
-    def size(self) -> int:
-        """Bytes of the frame."""
-        return self.stop - self.begin + 3 * self.states
-
-    def body(self, taken: npt.NDArray[np.uint8]) -> bytes:
-        if not self.states:
-            return taken[self.begin : self.stop].tobytes()
-        values = self.begin + STAMP_SIZE
-        states = taken[values : values + self.states].view(np.int8).astype("<f4")
-        return (
-            taken[self.begin : values].tobytes() + states.tobytes() + taken[values + self.states : self.stop].tobytes()
-        )
 
 
 class _Shape(NamedTuple):
@@ -177,10 +162,10 @@ class _PapillArrayFramer(Framer):
             if self._shape is None:
                 self.counters.refused += 1
                 return None
-            sizes = [(frame.identifier, frame.size) for frame in self._shape.frames]
+            sizes = [(frame.identifier, frame.stop - frame.begin) for frame in self._shape.frames]
             news = [Framed(NEWS, np.array(sizes, "<u2").tobytes(), end)]
-        taken = parts[self._shape.take]
-        return news + [Framed(frame.identifier, frame.body(taken), end) for frame in self._shape.frames]
+        taken = parts[self._shape.take].tobytes()
+        return news + [Framed(cut.identifier, taken[cut.begin : cut.stop], end) for cut in self._shape.frames]
 
 
 class _ShapeReading:
@@ -243,8 +228,7 @@ def _shape_of(packet: bytes) -> _Shape | None:
             block = BLOCKS[kind]
             for sensor, places in enumerate(reading.entries(block, width)):
                 if places:
-                    states = block.states * len(places) // block.size
-                    frames.append(_Cut(sensor << 4 | kind, len(take), states, len(take) + STAMP_SIZE + len(places)))
+                    frames.append(_Cut(sensor << 4 | kind, len(take), len(take) + STAMP_SIZE + len(places)))
                     take += stamp + places
     except (KeyError, ValueError):
         return None

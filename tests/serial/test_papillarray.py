@@ -36,8 +36,8 @@ NEWS = 0x400
 FRAMES = {
     3: STAMP + PILLARS[12:36] + PILLARS[38:],
     4: STAMP + TOTAL[6:],
-    5: STAMP + struct.pack("<4f", -2, 3, -1, 0.75),
-    6: STAMP + struct.pack("<3f", 2, 0.75, 10),
+    5: STAMP + struct.pack("<2b2f", -2, 3, -1, 0.75),
+    6: STAMP + struct.pack("<b2f", 2, 0.75, 10),
 }
 
 
@@ -126,10 +126,10 @@ def test_the_emulated_controller_obeys() -> None:
     assert len(controller.answers(b"f250\n", 1000)) == pytest.approx(250, abs=2)
 
 
-def _states(packets: Sequence[bytes]) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def _states(packets: Sequence[bytes]) -> np.ndarray[tuple[int, int], np.dtype[np.int8]]:
     """The slip states of the first sensor's pillars."""
     frames = PapillArrayPackets().framer().feed(b"".join(packets))
-    return np.array([np.frombuffer(frame.body, "<f4", 9, 8) for frame in frames if frame.identifier == 5])
+    return np.array([np.frombuffer(frame.body, "i1", 9, 8) for frame in frames if frame.identifier == 5])
 
 
 def test_values_after_taking_zero() -> None:
@@ -138,10 +138,10 @@ def test_values_after_taking_zero() -> None:
     controller.answers(b"z\n", 1)
     [packets] = controller.answers(b"", 1)
     frames = {frame.identifier: frame.body for frame in PapillArrayPackets().framer().feed(packets)}
-    pillars, total, slip = (np.frombuffer(frames[kind], "<f4", offset=8) for kind in (3, 4, 6))
+    pillars, total = (np.frombuffer(frames[kind], "<f4", offset=8) for kind in (3, 4))
     assert (np.abs(pillars) < 0.1).all()
     assert (np.abs(total) < 1).all()
-    assert slip.tolist() == [0, -1, -1]
+    assert struct.unpack_from("<b2f", frames[6], 8) == (0, -1, -1)
 
 
 def test_listening_only() -> None:

@@ -22,31 +22,29 @@ if TYPE_CHECKING:
     from skinware_drivers.doctor.examining import Examination
 
 _WIDTH = 80
-_LABEL = 10
+_LABEL, _AREA = 10, 14
 _SIGNS = {Severity.ERROR: ("✗", "red"), Severity.WARNING: ("!", "yellow"), Severity.NOTE: ("·", "cyan")}
 
 
-def as_text(evidence: Evidence, found: Examination, report: str | None = None) -> list[str]:
+def as_text(evidence: Evidence, found: Examination, width: int | None = _WIDTH) -> list[str]:
     """Return the lines to print, with colours, which ``echo`` takes out without a terminal."""
-    lines = [*_verdict(evidence, found), ""]
+    lines = [*wrapped(_verdict(evidence, found), width, hang=0), ""]
     for finding in found.findings:
-        lines += [*_finding(finding), ""]
+        lines += [*_finding(finding, width), ""]
     lines += [style("looked at", underline=True)]
     for area, looked in groupby(found.looked, key=lambda one: one.area):
         for number, one in enumerate(looked):
-            lines += _row("" if number else area, f"{style(one.what, bold=True)}: {one.seen}", width=14)
+            lines += _row("" if number else area, f"{style(one.what, bold=True)}: {one.seen}", width, _AREA)
     if found.not_looked:
         lines += ["", style("not looked at", underline=True)]
         for area, not_looked in groupby(found.not_looked, key=lambda one: one.area):
             for number, missing in enumerate(not_looked):
-                lines += _row("" if number else area, f"{style(missing.what, bold=True)}: {missing.why}", width=14)
-                lines += [f"{'':16}$ {command}" for command in missing.commands]
-    if report is not None:
-        lines += ["", f"written to {report}; read it before you give it to others"]
+                lines += _row("" if number else area, f"{style(missing.what, bold=True)}: {missing.why}", width, _AREA)
+                lines += [f"{'':{_AREA + 2}}$ {command}" for command in missing.commands]
     return lines
 
 
-def _verdict(evidence: Evidence, found: Examination) -> Iterator[str]:
+def _verdict(evidence: Evidence, found: Examination) -> str:
     span = age_text(evidence.seconds * 1e9)
     drivers = plural(len(evidence.drivers), "driver")
     if evidence.recording is not None:
@@ -59,27 +57,27 @@ def _verdict(evidence: Evidence, found: Examination) -> Iterator[str]:
         if (count := sum(one.severity == severity for one in found.findings))
     ]
     verdict = ", ".join(counts) or style("nothing found", fg="green", bold=True)
-    yield from wrapped(f"{verdict}  {style(f'({about})', dim=True)}", _WIDTH, hang=0)
+    return f"{verdict}  {style(f'({about})', dim=True)}"
 
 
-def _finding(finding: Finding) -> Iterator[str]:
+def _finding(finding: Finding, width: int | None) -> Iterator[str]:
     sign, colour = _SIGNS[finding.severity]
     head = f"{style(f'{sign} {finding.area}', fg=colour, bold=True)}  {style(finding.what, bold=True)}"
-    yield from wrapped(head, _WIDTH)
+    yield from wrapped(head, width)
     for label, text in (
         ("where", finding.where),
         ("evidence", finding.evidence),
         ("do", finding.action),
     ):
-        yield from _row(label, text)
+        yield from _row(label, text, width)
     for command in finding.commands:
         yield f"{'':{_LABEL + 2}}{style('$ ' + command, fg='green')}"
-    yield from _row("see", style(f"docs/{finding.see}", dim=True))
+    yield from _row("see", style(f"docs/{finding.see}", dim=True), width)
 
 
-def _row(label: str, text: str, width: int = _LABEL) -> Iterator[str]:
-    head = "  " + style(f"{label:<{width}}", dim=True)
-    yield from wrapped(head + text, _WIDTH, hang=width)
+def _row(label: str, text: str, width: int | None, hang: int = _LABEL) -> list[str]:
+    head = "  " + style(f"{label:<{hang}}", dim=True)
+    return wrapped(head + text, width, hang)
 
 
 @cli.command(
@@ -117,13 +115,16 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
         from skinware_drivers.doctor.report import as_markdown
 
         try:
-            report.write_text(as_markdown(evidence, found), encoding="utf-8")
+            lines = map(click.unstyle, as_text(evidence, found, width=None))
+            report.write_text(as_markdown(lines, evidence.drivers), encoding="utf-8")
         except OSError as error:
             raise ConfigurationError(f"{report}: {error.strerror or error}") from None
     if as_json:
         print_json(as_data(evidence, found))
     else:
-        echo("\n".join(as_text(evidence, found, None if report is None else str(report))))
+        echo("\n".join(as_text(evidence, found)))
+        if report is not None:
+            echo(f"\nwritten to {report}; read it before you give it to others")
     if found.findings:
         click.get_current_context().exit(cli.EXIT_FAILED)
 

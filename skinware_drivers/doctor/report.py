@@ -10,9 +10,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from skinware.text import age_text, plural, printable
-from skinware_drivers.doctor.evidence import Counted, DriverSeen, Evidence
-from skinware_drivers.doctor.examining import Examination
+from skinware.text import plural, printable
+from skinware_drivers.doctor.evidence import Counted, DriverSeen
 
 _PEOPLE = range(1000, 65534)
 """Numbers of accounts of people."""
@@ -95,42 +94,12 @@ def _longest_first(of: Mapping[str, str]) -> Iterable[tuple[str, str]]:
     return sorted(of.items(), key=lambda pair: -len(pair[0]))
 
 
-def as_markdown(evidence: Evidence, found: Examination, secrets: Secrets | None = None) -> str:
-    about = "a running skin" if evidence.recording is None else f"the recording {evidence.recording.name}"
-    span = age_text(evidence.seconds * 1e9)
-    drivers, findings = plural(len(evidence.drivers), "driver"), plural(len(found.findings), "finding")
-    lines = ["# Report of skin-doctor", "", f"{findings} in {about}, {span}, {drivers}.", ""]
-    for number, finding in enumerate(found.findings, 1):
-        lines += [
-            f"## {number}. {finding.severity.name.lower()}: {finding.what}",
-            "",
-            f"* area: {finding.area}",
-            f"* where: {finding.where}",
-            f"* evidence: {finding.evidence}",
-            f"* what to do: {finding.action} (docs/{finding.see})",
-            "",
-        ]
-        if finding.commands:
-            lines += ["```console", *finding.commands, "```", ""]
-    lines += ["## Looked at", ""]
-    lines += _table(("area", "what", "seen"), [(one.area, one.what, one.seen) for one in found.looked])
-    lines += ["## Not looked at", ""]
-    lines += _table(("area", "what", "why"), [(one.area, one.what, one.why) for one in found.not_looked])
-    for driver in evidence.drivers:
-        lines += _driver(driver)
-    text = "\n".join(map(printable, lines)) + "\n"
-    return scrubbed(text, secrets or Secrets.of_this_machine())
-
-
-def _table(titles: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[str]:
-    if not rows:
-        yield from ("Nothing.", "")
-        return
-    yield f"| {' | '.join(titles)} |"
-    yield f"|{'---|' * len(titles)}"
-    for row in rows:
-        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
-    yield ""
+def as_markdown(lines: Iterable[str], drivers: Iterable[DriverSeen], secrets: Secrets | None = None) -> str:
+    """Return these lines of text and all counters of these drivers, without secrets."""
+    written = ["# Report of skin-doctor", "", "```text", *lines, "```", ""]
+    for driver in drivers:
+        written += _driver(driver)
+    return scrubbed("\n".join(map(printable, written)) + "\n", secrets or Secrets.of_this_machine())
 
 
 def _driver(driver: DriverSeen) -> Iterator[str]:

@@ -40,5 +40,6 @@ def test_no_contents_of_frames_are_too_much(dtype: str, tmp_path: Path) -> None:
         for evidence in (seen, look_at(file)):
             told = examine(evidence)
             assert told.findings
-            assert as_markdown(evidence, told, Secrets())
-            assert as_text(evidence, told)
+            text = as_text(evidence, told)
+            assert text
+            assert as_markdown(text, evidence.drivers, Secrets())

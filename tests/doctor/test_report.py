@@ -8,11 +8,12 @@ import re
 import socket
 from pathlib import Path
 
+import click
 import pytest
 
 from skinware import Namespace
 from skinware.cli._command import exit_status
-from skinware_drivers.cli.doctor import command
+from skinware_drivers.cli.doctor import as_text, command
 from skinware_drivers.doctor.examining import examine
 from skinware_drivers.doctor.report import Secrets, as_markdown, scrubbed
 from tests.cli.fake_skin import FakeSkin, publishing
@@ -105,12 +106,12 @@ def test_it_is_markdown_that_tells_all(namespace: Namespace) -> None:
     with publishing(skin):
         evidence = looked()
     found = examine(evidence)
-    text = as_markdown(evidence, found, Secrets())
+    text = as_markdown(map(click.unstyle, as_text(evidence, found, width=None)), evidence.drivers, Secrets())
     for finding in found.findings:
-        assert f"{finding.severity.name.lower()}: {finding.what}" in text
-        assert f"* evidence: {finding.evidence}" in text
+        assert f"{finding.area}  {finding.what}" in text
+        assert f"  evidence  {finding.evidence}" in text
     for looked_at in found.looked:
-        assert f"| {looked_at.area} | {looked_at.what} |" in text
+        assert f"{looked_at.what}: {looked_at.seen}" in text
     assert "bus can0: frames 5156 (+0), dropped 2 (+0), unknown 7 (+0)" in text
     assert text.count("```") % 2 == 0
 

@@ -17,8 +17,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -49,6 +48,8 @@ _LOOK_S = 1.0
 """Time between two looks for the router."""
 _NODE = 0
 """Number of the only node in a session."""
+PUBLISHER, SERVICE = "MP", "SS"
+"""Kinds of endpoints."""
 
 
 def graph_endpoints(connect: Sequence[str]) -> Endpoints:
@@ -101,7 +102,7 @@ class ZenohNode:
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> TopicPublisher:
         at = key(self._identity, topic, message_type)
-        token = self._endpoint_token(EndpointKind.PUBLISHER, topic, message_type, qos)
+        token = self._endpoint_token(PUBLISHER, topic, message_type, qos)
         with _as_bridge_error(topic):
             declared = _declare_publisher(self._session, at, qos)
         made = _ZenohPublisher(declared, self._announce(token), gid(token), qos, self._endpoints.discard)
@@ -110,7 +111,7 @@ class ZenohNode:
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
         at = key(self._identity, name, service_type)
-        token = self._endpoint_token(EndpointKind.SERVICE, name, service_type, _SERVICE_QOS)
+        token = self._endpoint_token(SERVICE, name, service_type, _SERVICE_QOS)
         made = _ZenohService(at, handler, self._answering, self._endpoints.discard)
         with _as_bridge_error(name):
             asked = directly(lambda query: self._asked(made, query))
@@ -127,7 +128,7 @@ class ZenohNode:
             self._worker.join()
         self._close_session()
 
-    def _endpoint_token(self, kind: EndpointKind, name: str, of_type: MessageType, qos: Qos) -> str:
+    def _endpoint_token(self, kind: str, name: str, of_type: MessageType, qos: Qos) -> str:
         return endpoint_token(self._identity, self._zid, _NODE, next(self._numbers), kind, name, of_type, qos)
 
     def _announce(self, token: str) -> zenoh.LivelinessToken:
@@ -191,7 +192,7 @@ class _ZenohPublisher:
         if not self._is_open:
             return False
         self._sequence += 1
-        attachment = MessageAttachment(self._sequence, time.time_ns(), self._gid).packed()
+        attachment = packed_attachment(self._sequence, time.time_ns(), self._gid)
         try:
             self._publisher.put(message, attachment=attachment)
         except zenoh.ZError:  # the session is closed
@@ -220,11 +221,11 @@ class _ZenohService:
             if not self._is_open:
                 return _refuse(query, "the service ended")
             try:
-                asked = MessageAttachment.of(_bytes(query.attachment))
+                sequence, _, asker = read_attachment(_bytes(query.attachment))
             except ValueError as error:
                 return _refuse(query, str(error))
             response = self._handler(_bytes(query.payload))
-        attachment = MessageAttachment(asked.sequence, time.time_ns(), asked.gid).packed()
+        attachment = packed_attachment(sequence, time.time_ns(), asker)
         with contextlib.suppress(zenoh.ZError), query:
             query.reply(self._at, response, attachment=attachment, express=True)
         return None
@@ -285,45 +286,30 @@ _DEFAULT_DEPTH = 42
 """Depth that is not written."""
 
 
-class EndpointKind(Enum):
-    """Kinds of endpoints."""
+def packed_attachment(sequence: int, time_ns: int, gid: bytes) -> bytes:
+    """Return the attachment of a message, a request or a response, 33 bytes.
 
-    PUBLISHER = "MP"
-    SERVICE = "SS"
-
-
-@dataclass(frozen=True)
-class MessageAttachment:
-    """The attachment of a message, request or response.
-
-    Attributes:
+    Args:
         sequence: number of the message, by its sender, from 1 on; a response has that of its request.
         time_ns: when it was sent, ns since 1970.
         gid: identity of the sender, 16 bytes; a response has that of its request.
     """
+    return _ATTACHMENT.pack(sequence, time_ns, _GID_BYTES, gid)
 
-    sequence: int
-    time_ns: int
-    gid: bytes
 
-    def packed(self) -> bytes:
-        """Return its 33 bytes."""
-        return _ATTACHMENT.pack(self.sequence, self.time_ns, _GID_BYTES, self.gid)
+def read_attachment(data: bytes) -> tuple[int, int, bytes]:
+    """Return the sequence, time and gid of an attachment, see :func:`packed_attachment`.
 
-    @classmethod
-    def of(cls, data: bytes) -> MessageAttachment:
-        """Read an attachment.
-
-        Raises:
-            ValueError: it is malformed.
-        """
-        try:
-            sequence, time_ns, gid_bytes, gid = _ATTACHMENT.unpack(data)
-        except struct.error:
-            raise ValueError(f"an attachment has {_ATTACHMENT.size} bytes, not {len(data)}") from None
-        if gid_bytes != _GID_BYTES:
-            raise ValueError(f"an identity has {_GID_BYTES} bytes, not {gid_bytes}")
-        return cls(sequence, time_ns, gid)
+    Raises:
+        ValueError: it is malformed.
+    """
+    try:
+        sequence, time_ns, gid_bytes, gid = _ATTACHMENT.unpack(data)
+    except struct.error:
+        raise ValueError(f"an attachment has {_ATTACHMENT.size} bytes, not {len(data)}") from None
+    if gid_bytes != _GID_BYTES:
+        raise ValueError(f"an identity has {_GID_BYTES} bytes, not {gid_bytes}")
+    return sequence, time_ns, gid
 
 
 def key(identity: NodeIdentity, name: str, of_type: MessageType) -> str:
@@ -347,13 +333,13 @@ def endpoint_token(
     session: str,
     node: int,
     endpoint: int,
-    kind: EndpointKind,
+    kind: str,
     name: str,
     of_type: MessageType,
     qos: Qos,
 ) -> str:
     """Return the token of a publisher or a service, which has a number of its own in the session."""
-    place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind.value, *_of_node(identity))
+    place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind, *_of_node(identity))
     return "/".join((*place, name.replace("/", "%"), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
 
 

@@ -27,7 +27,7 @@ if find_spec("zenoh") is None or find_spec("xxhash") is None:
 
 from skinware.bridge.endpoints import DEFAULT_ROUTER
 from skinware.bridge.link import ZenohLink
-from skinware.ros2.rmw_zenoh import MessageAttachment, gid, graph_endpoints
+from skinware.ros2.rmw_zenoh import gid, graph_endpoints, read_attachment
 
 _TOKEN_PARTS, _MOST_TOKENS = 13, 8192
 _AT_ONCE = 64
@@ -127,20 +127,20 @@ class ZenohPort(TopicPort):
             _, *topic, type_name, _ = key.split("/")
             number = numbers.get((name := "/".join(["rt", *topic]), type_name))
             try:
-                attachment = MessageAttachment.of(attached)
+                sequence, sent_ns, publisher = read_attachment(attached)
             except ValueError:
                 number = None
             if number is None or len(sample) > LONGEST:
                 self.refused += 1
-            elif self.is_read(name, number, attachment.gid, time_ns):
-                publisher, before = self._sequences.get(name, (b"", 0))
-                step = attachment.sequence - before if publisher == attachment.gid else 1
+            elif self.is_read(name, number, publisher, time_ns):
+                last, before = self._sequences.get(name, (b"", 0))
+                step = sequence - before if last == publisher else 1
                 if -_OVERTAKEN <= step < 0:
                     self.refused += 1
                     continue
                 self.dropped += max(0, step - 1)
-                self._sequences[name] = attachment.gid, attachment.sequence
-                records.append(record(number, attachment.time_ns, sample))
+                self._sequences[name] = publisher, sequence
+                records.append(record(number, sent_ns, sample))
         if self._samples:
             self._wake()
         return b"".join(records)

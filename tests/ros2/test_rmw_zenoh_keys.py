@@ -12,7 +12,17 @@ from hypothesis import strategies as some
 
 from skinware.errors import BridgeError, MissingExtra
 from skinware.ros2 import rmw_zenoh
-from skinware.ros2.rmw_zenoh import EndpointKind, MessageAttachment, endpoint_token, gid, key, node_token, qos_text
+from skinware.ros2.rmw_zenoh import (
+    PUBLISHER,
+    SERVICE,
+    endpoint_token,
+    gid,
+    key,
+    node_token,
+    packed_attachment,
+    qos_text,
+    read_attachment,
+)
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos, ServiceType
 
 STRING = MessageType("std_msgs/msg/String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18")
@@ -41,7 +51,7 @@ def test_key_of_a_service() -> None:
 def test_humble_has_no_hashes() -> None:
     humble = NodeIdentity("talker", distro=Distro.HUMBLE)
     assert key(humble, "/chatter", STRING) == "0/chatter/std_msgs::msg::dds_::String_/TypeHashNotSupported"
-    token = endpoint_token(humble, "f00d", 0, 1, EndpointKind.PUBLISHER, "/chatter", STRING, Qos(depth=7))
+    token = endpoint_token(humble, "f00d", 0, 1, PUBLISHER, "/chatter", STRING, Qos(depth=7))
     assert token == (
         "@ros2_lv/0/f00d/0/1/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/TypeHashNotSupported/::,7:,:,:,,"
     )
@@ -60,7 +70,7 @@ def test_token_of_a_node_in_namespaces() -> None:
 
 def test_token_of_a_publisher() -> None:
     session = "8b20917502ee955ac4476e0266340d5c"
-    assert endpoint_token(TALKER, session, 0, 10, EndpointKind.PUBLISHER, "/chatter", STRING, Qos(depth=7)) == (
+    assert endpoint_token(TALKER, session, 0, 10, PUBLISHER, "/chatter", STRING, Qos(depth=7)) == (
         "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_"
         "/RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18/::,7:,:,:,,"
     )
@@ -69,7 +79,7 @@ def test_token_of_a_publisher() -> None:
 def test_token_of_a_service() -> None:
     server = NodeIdentity("add_two_ints_server", domain=2)
     session = "f9980ee0495eaafb3e38f0d19e2eae12"
-    assert endpoint_token(server, session, 0, 10, EndpointKind.SERVICE, "/add_two_ints", ADD, Qos(depth=10)) == (
+    assert endpoint_token(server, session, 0, 10, SERVICE, "/add_two_ints", ADD, Qos(depth=10)) == (
         "@ros2_lv/2/f9980ee0495eaafb3e38f0d19e2eae12/0/10/SS/%/%/add_two_ints_server/%add_two_ints"
         "/example_interfaces::srv::dds_::AddTwoInts_"
         "/RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a/::,10:,:,:,,"
@@ -100,7 +110,7 @@ def test_names_that_ros_does_not_have_are_refused(name: str) -> None:
 def test_identities_are_hashes_of_tokens() -> None:
     assert gid("").hex() == "7f498d4624c30160d8984701d306aa99"  # XXH3, 128 bits, of nothing; its low half first
     tokens = [
-        endpoint_token(identity, session, 0, number, EndpointKind.PUBLISHER, "/chatter", STRING, Qos())
+        endpoint_token(identity, session, 0, number, PUBLISHER, "/chatter", STRING, Qos())
         for identity in (TALKER, replace(TALKER, domain=3))
         for session in ("1", "2")
         for number in (1, 2)
@@ -110,23 +120,23 @@ def test_identities_are_hashes_of_tokens() -> None:
 
 
 def test_an_attachment_has_33_bytes() -> None:
-    attachment = MessageAttachment(258, 1_700_000_000_000_000_001, bytes(range(16)))
-    assert attachment.packed().hex(" ") == (
+    attachment = 258, 1_700_000_000_000_000_001, bytes(range(16))
+    assert packed_attachment(*attachment).hex(" ") == (
         "02 01 00 00 00 00 00 00 01 00 2a 36 fe 9c 97 17 10 00 01 02 03 04 05 06 07 08 09 0a 0b 0c 0d 0e 0f"
     )
-    assert MessageAttachment.of(attachment.packed()) == attachment
+    assert read_attachment(packed_attachment(*attachment)) == attachment
 
 
 @pytest.mark.parametrize("data", [b"", bytes(32), bytes(34), bytes(33), bytes(16) + b"\x11" + bytes(16)])
 def test_bytes_that_are_no_attachment_are_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match="bytes, not"):
-        MessageAttachment.of(data)
+        read_attachment(data)
 
 
 @given(some.binary(max_size=64))
 def test_any_bytes_are_an_attachment_or_refused(data: bytes) -> None:
     try:
-        assert MessageAttachment.of(data).packed() == data
+        assert packed_attachment(*read_attachment(data)) == data
     except ValueError:
         assert len(data) != 33 or data[16] != 16
 

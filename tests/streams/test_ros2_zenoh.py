@@ -20,7 +20,7 @@ pytest.importorskip("cyclonedds", reason="needs the extra ros2")
 
 from skinware import DriverReader, Namespace
 from skinware.errors import ConfigurationError
-from skinware.ros2.rmw_zenoh import MessageAttachment, ZenohNode
+from skinware.ros2.rmw_zenoh import ZenohNode, packed_attachment
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
 from skinware.status import Status
 from skinware_drivers.registry import make_bus
@@ -145,17 +145,17 @@ def test_samples_that_are_lost_or_wrong_are_counted(at: Router) -> None:
     sample, key = serialized(case_of("std_msgs/msg/UInt16").sample(1)), f"5/touch/{topic.dds_type}/{HASH}"
     with joined(at, 5, [topic], "&depth=4") as port:
         for sequence in (1, 2, 5):
-            port._sample(key, MessageAttachment(sequence, 10**18, bytes(16)).packed(), sample)
+            port._sample(key, packed_attachment(sequence, 10**18, bytes(16)), sample)
         port._sample(key, b"", sample)
-        port._sample(key, MessageAttachment(6, 10**18, bytes(16)).packed(), sample)  # finds no room
+        port._sample(key, packed_attachment(6, 10**18, bytes(16)), sample)  # finds no room
         assert port.read(0).count(sample) == 3
         assert (port.dropped, port.refused) == (2, 1)
-        port._sample(key, MessageAttachment(7, 10**18, bytes(16)).packed(), sample)
-        port._sample("5/touch/std_msgs::msg::dds_::Int8_/x", MessageAttachment(8, 0, bytes(16)).packed(), sample)
-        port._sample(key, MessageAttachment(6, 10**18, bytes(16)).packed(), sample)  # 7 has overtaken it
+        port._sample(key, packed_attachment(7, 10**18, bytes(16)), sample)
+        port._sample("5/touch/std_msgs::msg::dds_::Int8_/x", packed_attachment(8, 0, bytes(16)), sample)
+        port._sample(key, packed_attachment(6, 10**18, bytes(16)), sample)  # 7 has overtaken it
         assert port.read(0).count(sample) == 1
         assert (port.dropped, port.refused) == (3, 3)
-        port._sample(key, MessageAttachment(8, 10**18, bytes(16)).packed(), bytes(1 << 21))
+        port._sample(key, packed_attachment(8, 10**18, bytes(16)), bytes(1 << 21))
         assert len(port._samples[0][2]) < 1 << 21
         assert port.read(0) == b""
         assert port.refused == 4

@@ -6,8 +6,8 @@ import errno
 import fcntl
 import socket
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +19,12 @@ NO_CAN = "this kernel has no CAN: load it (sudo modprobe can-raw), or use a bus 
 
 # linux/rtnetlink.h, linux/if_link.h, linux/can/netlink.h
 _RTM_NEWLINK, _RTM_GETLINK, _NLM_F_REQUEST, _NLMSG_ERROR = 16, 18, 1, 2
-_IFLA_IFNAME, _IFLA_LINKINFO, _IFLA_INFO_DATA = 3, 18, 2
+_IFLA_IFNAME, _IFLA_LINKINFO, _IFLA_INFO_KIND, _IFLA_INFO_DATA, _IFLA_INFO_XSTATS = 3, 18, 1, 2, 3
 _IFLA_CAN_BITTIMING, _IFLA_CAN_STATE, _IFLA_CAN_RESTART_MS, _IFLA_CAN_DATA_BITTIMING = 1, 4, 6, 9
 _HEADER, _INTERFACE, _ERROR = struct.Struct("=IHHII"), struct.Struct("=BxHiII"), struct.Struct("=i")
 _ANSWER_BYTES = 1 << 16
+_ERRORS = ("bus_error", "error_warning", "error_passive", "bus_off", "arbitration_lost", "restarts")
+"""Counters in ``struct can_device_stats``, u32 each."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +36,25 @@ class Controller:
         state: 0 error-active, 1 error-warning, 2 error-passive, 3 bus-off, 4 stopped, 5 sleeping; None: unknown.
         restart_ms: pause before it returns from bus-off by itself; 0: it does not return.
         data_bit_rate: of the data phase of CAN FD, bit/s; 0 if not set.
+        sample_point: 0 to 1; 0 if not set.
+        errors: counters of the kernel driver, by name: ``bus_error``, ``bus_off`` ...
     """
 
     bit_rate: int = 0
     state: int | None = None
     restart_ms: int = 0
     data_bit_rate: int = 0
+    sample_point: float = 0.0
+    errors: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_controller(interface: str) -> Controller | None:
     """Return the controller of an interface; None if it has none (``vcan``) or cannot be asked."""
+    return read_link(interface)[1]
+
+
+def read_link(interface: str) -> tuple[str, Controller | None]:
+    """Return the kind of an interface (``can``, ``vcan``; empty: unknown) and its controller as ``read_controller``."""
     return parse_answer(_ask_for_link(interface))
 
 
@@ -73,21 +84,29 @@ def _ask_for_link(interface: str) -> bytes:
         return b""
 
 
-def parse_answer(answer: bytes) -> Controller | None:
-    """Return the controller in an ``RTM_NEWLINK`` message; None if it describes none."""
+def parse_answer(answer: bytes) -> tuple[str, Controller | None]:
+    """Return kind and controller in an ``RTM_NEWLINK`` message; empty and None if it describes none."""
     if len(answer) < _HEADER.size + _INTERFACE.size or _HEADER.unpack_from(answer)[1] != _RTM_NEWLINK:
-        return None
+        return "", None
     link = dict(_attributes(answer[_HEADER.size + _INTERFACE.size :]))
-    data = dict(_attributes(dict(_attributes(link.get(_IFLA_LINKINFO, b""))).get(_IFLA_INFO_DATA, b"")))
-    numbers = {kind: struct.unpack_from("=I", value)[0] for kind, value in data.items() if len(value) >= 4}
+    info = dict(_attributes(link.get(_IFLA_LINKINFO, b"")))
+    kind = info.get(_IFLA_INFO_KIND, b"").rstrip(b"\0").decode(errors="replace")
+    data = {of: _numbers(value) for of, value in _attributes(info.get(_IFLA_INFO_DATA, b""))}
     if _IFLA_CAN_STATE not in data and _IFLA_CAN_BITTIMING not in data:
-        return None
-    return Controller(
-        bit_rate=numbers.get(_IFLA_CAN_BITTIMING, 0),
-        state=numbers.get(_IFLA_CAN_STATE),
-        restart_ms=numbers.get(_IFLA_CAN_RESTART_MS, 0),
-        data_bit_rate=numbers.get(_IFLA_CAN_DATA_BITTIMING, 0),
+        return kind, None
+    first = {of: numbers[0] for of, numbers in data.items() if numbers}
+    return kind, Controller(
+        bit_rate=first.get(_IFLA_CAN_BITTIMING, 0),
+        state=first.get(_IFLA_CAN_STATE),
+        restart_ms=first.get(_IFLA_CAN_RESTART_MS, 0),
+        data_bit_rate=first.get(_IFLA_CAN_DATA_BITTIMING, 0),
+        sample_point=sum(data.get(_IFLA_CAN_BITTIMING, ())[1:2]) / 1000,  # in tenths of a percent
+        errors=dict(zip(_ERRORS, _numbers(info.get(_IFLA_INFO_XSTATS, b"")), strict=False)),
     )
+
+
+def _numbers(data: bytes) -> tuple[int, ...]:
+    return struct.unpack_from(f"={len(data) // 4}I", data)
 
 
 def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:

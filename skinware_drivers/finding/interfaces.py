@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
 import errno
-import json
-import shutil
 import socket
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from skinware_drivers.can.controller import Controller, read_controller
+from skinware_drivers.can.controller import Controller, read_link
 from skinware_drivers.finding.ports import text_of
 
 _STATES = ("ERROR-ACTIVE", "ERROR-WARNING", "ERROR-PASSIVE", "BUS-OFF", "STOPPED", "SLEEPING")
@@ -22,8 +16,6 @@ _ARPHRD_CAN = 280
 _IFF_UP = 1
 _FD_MTU = 72
 _STATISTICS = ("rx_packets", "tx_packets", "rx_errors", "tx_errors", "rx_dropped", "tx_dropped", "rx_over_errors")
-_IP_TIMEOUT_S = 5.0
-_SYSTEM_PATH = "/usr/sbin:/sbin:/usr/bin:/bin"
 
 NO_INTERFACE = (
     "no CAN interface: is the adapter plugged in? For one without hardware:"
@@ -37,7 +29,7 @@ class CanInterface:
 
     Attributes:
         name: ``can0``.
-        kind: ``can`` (a controller), ``vcan``, ``vxcan``; ``virtual`` without iproute2.
+        kind: ``can`` (a controller), ``vcan``, ``vxcan``; ``virtual``: unknown.
         driver: kernel driver of the hardware; empty: none.
         carrier: operational state of the kernel: ``up``, ``down``, ``unknown``.
         bit_rate: bit/s of the arbitration phase; None: not set, or unknown.
@@ -96,68 +88,32 @@ def kernel_has_can() -> bool:
 
 
 def can_interfaces(
-    root: Path = Path("/sys"),
-    links: dict[str, dict[str, Any]] | None = None,
-    controller: Callable[[str], Controller | None] = read_controller,
+    root: Path = Path("/sys"), ask: Callable[[str], tuple[str, Controller | None]] = read_link
 ) -> list[CanInterface]:
-    """Return all CAN interfaces, by name.
-
-    Args:
-        links: output of iproute2 for each interface; default: run it.
-        controller: reads bit rate and state without iproute2.
-    """
-    known = ask_iproute2() if links is None else links
+    """Return all CAN interfaces, by name; ``ask`` returns kind and controller of one."""
     folders = sorted((root / "class/net").glob("*"))
-    found = [
-        _interface(folder, known.get(folder.name, {})) for folder in folders if _number(folder / "type") == _ARPHRD_CAN
-    ]
-    for number, one in enumerate(found):
-        own = None if known else controller(one.name)
-        if own is not None:
-            has_state = own.state is not None and own.state < len(_STATES)
-            found[number] = dataclasses.replace(
-                one,
-                kind="can",
-                bit_rate=own.bit_rate or None,
-                state=_STATES[own.state or 0] if has_state else "",
-                restart_ms=own.restart_ms,
-            )
-    return found
+    return [_interface(folder, *ask(folder.name)) for folder in folders if _number(folder / "type") == _ARPHRD_CAN]
 
 
-def ask_iproute2() -> dict[str, dict[str, Any]]:
-    """Return the output of ``ip`` for all interfaces; empty if it is missing or too old for JSON."""
-    command = shutil.which("ip") or shutil.which("ip", path=_SYSTEM_PATH)
-    if command is None:
-        return {}
-    arguments = [command, "-j", "-details", "-statistics", "link", "show"]
-    with contextlib.suppress(OSError, subprocess.SubprocessError, ValueError):
-        done = subprocess.run(arguments, capture_output=True, timeout=_IP_TIMEOUT_S, check=True)
-        return {link["ifname"]: link for link in json.loads(done.stdout) if "ifname" in link}
-    return {}
-
-
-def _interface(folder: Path, link: dict[str, Any]) -> CanInterface:
-    info: dict[str, Any] = link.get("linkinfo", {})
-    data: dict[str, Any] = info.get("info_data", {})
-    has_hardware = (folder / "device").exists()
-    driver = (folder / "device/driver").resolve().name if (folder / "device/driver").exists() else ""
-    timing = data.get("bittiming", {})
+def _interface(folder: Path, kind: str, controller: Controller | None) -> CanInterface:
+    own = controller or Controller()
+    has_state = own.state is not None and own.state < len(_STATES)
+    has_hardware = controller is not None or (folder / "device").exists()
     return CanInterface(
         name=folder.name,
-        kind=info.get("info_kind", "can" if has_hardware else "virtual"),
-        driver=driver,
+        kind=kind or ("can" if has_hardware else "virtual"),
+        driver=(folder / "device/driver").resolve().name if (folder / "device/driver").exists() else "",
         up=bool((_number(folder / "flags", 16) or 0) & _IFF_UP),
         carrier=text_of(folder / "operstate"),
         is_fd=(_number(folder / "mtu") or 0) >= _FD_MTU,
         queue_length=_number(folder / "tx_queue_len") or 0,
-        bit_rate=timing.get("bitrate") or None,
-        data_bit_rate=data.get("data_bittiming", {}).get("bitrate") or None,
-        sample_point=float(timing["sample_point"]) if timing.get("sample_point") else None,
-        state=data.get("state", ""),
-        restart_ms=data.get("restart_ms", 0 if data.get("state") else None),
+        bit_rate=own.bit_rate or None,
+        data_bit_rate=own.data_bit_rate or None,
+        sample_point=own.sample_point or None,
+        state=_STATES[own.state or 0] if has_state else "",
+        restart_ms=None if controller is None else own.restart_ms,
         statistics={name: _number(folder / "statistics" / name) or 0 for name in _STATISTICS},
-        controller_errors={name: int(count) for name, count in info.get("info_xstats", {}).items()},
+        controller_errors=dict(own.errors),
     )
 
 

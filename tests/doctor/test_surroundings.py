@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from skinware import DriverReader, Namespace
+from skinware_drivers.can.controller import Controller
 from skinware_drivers.doctor import looking
 from skinware_drivers.doctor.evidence import Evidence, MachineSeen
 from skinware_drivers.doctor.examining import examine
@@ -23,7 +24,7 @@ from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_structure, publishing
 from tests.commands import running
 from tests.doctor.rig import found, found_until, looked, of
-from tests.finding.fakes import FakeMachine, add_interface, ip_link, write
+from tests.finding.fakes import CONTROLLER, FakeMachine, add_interface, write
 
 
 def evidence(**changes: object) -> Evidence:
@@ -39,8 +40,8 @@ def machine(**changes: object) -> MachineSeen:
     return dataclasses.replace(looking.MachineWatch().seen(), **changes)  # type: ignore[arg-type]
 
 
-def can(root: Path, *links: dict[str, object]) -> list[CanInterface]:
-    return can_interfaces(root, {str(link["ifname"]): link for link in links}, lambda _name: None)
+def can(root: Path, **controllers: Controller) -> list[CanInterface]:
+    return can_interfaces(root, lambda name: ("can", controllers[name]))
 
 
 # -- interfaces -----------------------------------------------------------------------------------------------------
@@ -50,13 +51,13 @@ def test_interfaces_that_are_down_off_the_bus_or_lose_frames(tmp_path: Path, mon
     add_interface(tmp_path, "can0", driver="peak_usb", flags=0x1002)
     add_interface(tmp_path, "can1", flags=0x1003)
     add_interface(tmp_path, "can2", flags=0x1003)
-    links = [ip_link("can0"), ip_link("can1", state="BUS-OFF", restart_ms=0), ip_link("can2")]
+    off_bus = dataclasses.replace(CONTROLLER, state=3, restart_ms=0)
     looks = iter(range(100))
 
     def interfaces_now() -> list[CanInterface]:
         number = next(looks)
         write(tmp_path / "class/net/can2/statistics", rx_dropped=3 * number, rx_packets=1000 * number)
-        return can(tmp_path, *links)
+        return can(tmp_path, can0=CONTROLLER, can1=off_bus, can2=CONTROLLER)
 
     monkeypatch.setattr(interfaces, "can_interfaces", interfaces_now)
     monkeypatch.setattr(interfaces, "kernel_has_can", lambda: True)
@@ -82,9 +83,8 @@ def test_interfaces_that_are_down_off_the_bus_or_lose_frames(tmp_path: Path, mon
 
 def test_an_interface_that_was_never_configured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     add_interface(tmp_path, "can0", driver="peak_usb", flags=0x1002)
-    monkeypatch.setattr(
-        interfaces, "can_interfaces", lambda: can(tmp_path, ip_link("can0", bittiming={}, state="STOPPED"))
-    )
+    stopped = Controller(state=4, restart_ms=100)
+    monkeypatch.setattr(interfaces, "can_interfaces", lambda: can(tmp_path, can0=stopped))
     monkeypatch.setattr(interfaces, "kernel_has_can", lambda: True)
     (finding,) = findings(looked(0.0), "interfaces")
     assert finding.commands[0] == "sudo ip link set can0 type can bitrate 1000000 restart-ms 100"

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from skinware.memory.namespace import Namespace
 from skinware_drivers.bus import FrameBatch
+from skinware_drivers.can.controller import Controller
 from skinware_drivers.finding import running
 from skinware_drivers.finding.guess import Traffic
 from skinware_drivers.finding.ports import Machine
@@ -123,23 +123,8 @@ def traffic_of(*frames: tuple[int, str], times: int = 1, payload_size: int = 64)
     return traffic
 
 
-def ip_link(name: str, **data: Any) -> dict[str, Any]:
-    """What ``ip -j -details -statistics link show`` says of a controller."""
-    info: dict[str, Any] = {
-        "state": "ERROR-ACTIVE",
-        "restart_ms": 100,
-        "bittiming": {"bitrate": 1000000, "sample_point": "0.750", "tq": 125},
-        **data,
-    }
-    counters = {
-        "restarts": 1,
-        "bus_error": 0,
-        "arbitration_lost": 0,
-        "error_warning": 3,
-        "error_passive": 0,
-        "bus_off": 0,
-    }
-    return {"ifname": name, "linkinfo": {"info_kind": "can", "info_data": info, "info_xstats": counters}}
+CONTROLLER = Controller(1_000_000, 0, 100, sample_point=0.75, errors={"error_warning": 3, "restarts": 1})
+"""One that works."""
 
 
 SKIN = [(0x473, "40 F0 F0 F0 F0 F0 F0 F0"), (0x473, "C0 F0 F0 F0 F0 F0 00 00")]

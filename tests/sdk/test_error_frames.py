@@ -131,31 +131,46 @@ def attribute(kind: int, data: bytes) -> bytes:
     return struct.pack("=HH", 4 + len(data), kind) + data + bytes(-len(data) % 4)
 
 
-def link_message(*of_controller: bytes, kind: int = 16) -> bytes:
-    info = attribute(1, b"can\0") + attribute(2 | 0x8000, b"".join(of_controller))
+def link_message(*of_controller: bytes, kind: int = 16, errors: bytes = b"") -> bytes:
+    counters = attribute(3, errors) if errors else b""
+    info = attribute(1, b"can\0") + counters + attribute(2 | 0x8000, b"".join(of_controller))
     body = struct.pack("=BxHiII", 0, 280, 3, 0x100C1, 0) + attribute(3, b"can0\0") + attribute(18 | 0x8000, info)
     return struct.pack("=IHHII", 16 + len(body), kind, 0, 1, 0) + body
+
+
+CONTROLLER_ERRORS = {
+    "bus_error": 1,
+    "error_warning": 2,
+    "error_passive": 3,
+    "bus_off": 4,
+    "arbitration_lost": 5,
+    "restarts": 6,
+}
 
 
 def test_a_controller_is_read_from_the_kernels_message() -> None:
     timing = struct.pack("=8I", 500_000, 875, 125, 6, 7, 2, 1, 2)
     state, restart = struct.pack("=I", 3), struct.pack("=I", 100)
-    whole = link_message(attribute(1, timing), attribute(4, state), attribute(6, restart))
-    assert parse_answer(whole) == Controller(500_000, 3, 100)
-    assert parse_answer(link_message(attribute(4, state))) == Controller(0, 3, 0)
+    errors = struct.pack("=6I", 1, 2, 3, 4, 5, 6)  # struct can_device_stats of linux/can/netlink.h
+    whole = link_message(attribute(1, timing), attribute(4, state), attribute(6, restart), errors=errors)
+    kind, controller = parse_answer(whole)
+    assert (kind, controller) == ("can", Controller(500_000, 3, 100, 0, 0.875, CONTROLLER_ERRORS))
+    assert parse_answer(link_message(attribute(4, state))) == ("can", Controller(0, 3, 0))
     data_timing = struct.pack("=8I", 5_000_000, 750, 25, 1, 1, 1, 1, 1)
     of_fd = link_message(attribute(1, timing), attribute(4, state), attribute(9, data_timing))
-    assert parse_answer(of_fd) == Controller(500_000, 3, 0, 5_000_000)
-    assert parse_answer(link_message()) is None  # a vcan
-    assert parse_answer(link_message(attribute(4, state), kind=2)) is None  # an error
-    assert parse_answer(b"") is None
+    assert parse_answer(of_fd) == ("can", Controller(500_000, 3, 0, 5_000_000, 0.875))
+    assert parse_answer(link_message()) == ("can", None)  # as a vcan, which has another name
+    assert parse_answer(link_message(attribute(4, state), kind=2)) == ("", None)  # an error
+    assert parse_answer(b"") == ("", None)
 
 
 @given(st.binary(max_size=200), st.integers(0, 200))
 def test_a_damaged_message_raises_nothing(noise: bytes, at: int) -> None:
-    whole = link_message(attribute(1, bytes(32)), attribute(4, bytes(4)))
+    whole = link_message(attribute(1, bytes(32)), attribute(4, bytes(4)), errors=bytes(24))
     for message in (whole[:at], whole[:16] + noise, whole[:at] + noise + whole[at:]):
-        assert isinstance(parse_answer(message), Controller | None)
+        kind, controller = parse_answer(message)
+        assert isinstance(kind, str)
+        assert isinstance(controller, Controller | None)
 
 
 def test_an_interface_without_a_controller_tells_of_none() -> None:

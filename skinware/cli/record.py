@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import pkgutil
 import re
 import signal
 import sys
@@ -89,6 +90,7 @@ def past(text: str) -> float:
 )
 @click.option("--wire", "with_wires", is_flag=True, help="Record also the frames and bytes on the drivers' buses.")
 @click.option("--until-eof", is_flag=True, hidden=True)
+@click.option("--disguise", type=pkgutil.resolve_name, hidden=True)
 @cli.namespace_option
 @cli.json_option
 def command(
@@ -101,6 +103,7 @@ def command(
     for_viewers: bool,
     with_wires: bool,
     until_eof: bool,
+    disguise: Callable[[], Callable[[str], str]] | None,
     namespace: str | None,
     as_json: bool,
 ) -> None:
@@ -130,7 +133,14 @@ def command(
     path = files[0] if files else Path(time.strftime("skin-%Y%m%d-%H%M%S.mcap"))
     target = _target(path, split_size, max_size, last_s)
     beside = Viewers().messages if for_viewers else None
-    recorder = Recorder(target, names=names or None, namespace=place, with_wires=with_wires, renderer=beside)
+    recorder = Recorder(
+        target,
+        names=names or None,
+        namespace=place,
+        with_wires=with_wires,
+        disguise=None if disguise is None else disguise(),
+        renderer=beside,
+    )
     report = _Progress(recorder, target, path, as_json)
     if until_eof:
         threading.Thread(target=_listen_until_eof, args=(recorder.mark,), daemon=True).start()
@@ -138,10 +148,10 @@ def command(
         report.ready(names, place.name, is_past=last_s is not None)
         try:
             recorder.run(duration_s, report.status)
-        except BaseException:
-            report.stopped(is_complete=False)
+        except BaseException as error:
+            report.stopped(getattr(error, "strerror", None) or str(error) or "interrupted")
             raise
-        report.stopped(is_complete=True)
+        report.stopped()
 
 
 def _target(path: Path, split_size: int | None, max_size: int | None, last_s: float | None) -> Target:
@@ -209,8 +219,9 @@ class _Progress:
                 set_s = event["by_ns"] / 1e9
                 cli.warn(f"the wall clock was set by {set_s:+.1f} s: times in the file go on as before")
 
-    def stopped(self, *, is_complete: bool) -> None:
-        """Report the end: everything that was taken is in the files, or else an error follows."""
+    def stopped(self, problem: str = "") -> None:
+        """Report the end: everything that was taken is in the files, unless there was a problem."""
+        is_complete = not problem
         self._news()
         messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
         absent = [name for name in self._names if not any(channel.split("/")[2:3] == [name] for channel in messages)]
@@ -220,7 +231,7 @@ class _Progress:
             cli.warn(why)
         if self._as_json:
             with contextlib.suppress(BrokenPipeError):
-                ends = {"file": (files or [""])[-1], "files": files, "is_complete": is_complete}
+                ends = {"file": (files or [""])[-1], "files": files, "is_complete": is_complete, "problem": problem}
                 print_json({"event": "stopped", **ends, **self._figures(messages)})
         if is_empty:
             raise ServiceNotFound(why)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
+import signal
 import subprocess
 import sys
 import threading
@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from skinware.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from skinware.recording.recorder import Recorder
     from skinware_drivers.virtual.recorded import Recorded
 
 
@@ -43,95 +42,83 @@ def _recorded(bus_name: str) -> Recorded | None:
     return recorded_driver(bus_name)
 
 
+_RECORD = ("-m", "skinware.cli.record", "--until-eof", "--wire", "--json")
+_DISGUISE = "skinware_drivers.doctor.report:Disguise"
 _END_S = 30.0
-"""Longest time to complete the file."""
+"""Longest time in which a program may end in good order."""
 
 
-class Capture:
-    """A recorder in a process of its own; ``result`` has ``bytes``, ``missed`` and ``problem`` after the end."""
+class EventProgram:
+    """A program beside this one, in Python, which prints events as JSON.
 
-    def __init__(self, path: Path, driver: str, namespace: str) -> None:
-        self.path = path
-        self.result: dict[str, Any] = {"bytes": 0, "missed": 0, "problem": "something else ended the recorder"}
+    It has a session of its own: Ctrl-C ends this program first, which then ends the other one.
+
+    Attributes:
+        events: the newest one of each kind, by its name.
+    """
+
+    def __init__(self, arguments: Sequence[str], ends_by: signal.Signals | None = None) -> None:
+        self.events: dict[str, dict[str, Any]] = {}
+        self._ends_by, self._begun = ends_by, threading.Event()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(path), driver, namespace],
+            [sys.executable, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            start_new_session=True,  # Ctrl-C ends the driver first, so that its last words are in the file
+            start_new_session=True,
         )
-        try:
-            begun = self._next()
-        except BaseException:  # such as Ctrl-C
-            self.end()
-            raise
-        if not begun.get("ready"):
-            self.end()
-            raise ConfigurationError(f"{path}: {begun.get('problem', 'nothing can be recorded')}")
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
 
-    def end(self) -> None:
-        if self._process.stdin is None or self._process.stdin.closed:
-            return
-        self._process.stdin.close()
+    def is_ready(self, timeout_s: float | None = None) -> bool:
+        """Wait until it is ready or has ended; return whether it is ready."""
+        self._begun.wait(timeout_s)
+        return "ready" in self.events
+
+    def close(self) -> None:
+        """Close its standard input, send it a signal if one ends it, and wait for its end. Idempotent."""
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None  # noqa: S101, PT018 - they are pipes
+        process.stdin.close()
+        if self._ends_by is not None:
+            process.send_signal(self._ends_by)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_S)
-        self._process.kill()  # of no effect where it has ended
-        self._process.wait()
-        self.result |= self._next()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+            process.wait(_END_S)
+        process.kill()  # of no effect where it has ended
+        process.wait()
+        self._thread.join()
+        process.stdout.close()
 
-    def _next(self) -> dict[str, Any]:
-        line = self._process.stdout.readline() if self._process.stdout is not None else ""
-        return dict(json.loads(line)) if line else {}
+    def _listen(self) -> None:
+        for line in self._process.stdout or ():
+            with contextlib.suppress(ValueError, TypeError, KeyError):  # code of others may print something else
+                event = dict(json.loads(line))
+                self.events[event["event"]] = event
+            if "ready" in self.events:
+                self._begun.set()
+        self._begun.set()
 
 
 @contextmanager
-def captured(path: Path, driver: str, namespace: str, on_end: Callable[[Capture], None]) -> Iterator[Capture]:
-    """Capture a driver while a block runs; start it inside. ``on_end`` is called when the file is complete."""
-    capture = Capture(path, driver, namespace)
-    try:
-        yield capture
-    finally:
-        capture.end()
-        on_end(capture)
+def captured(
+    path: Path, driver: str, namespace: str, on_end: Callable[[dict[str, Any]], object]
+) -> Iterator[dict[str, Any]]:
+    """Capture a driver while a block runs; start it inside. ``on_end`` gets the result when the file is complete.
 
-
-def _record(path: Path, driver: str, namespace: str) -> None:
-    from skinware.errors import SkinwareError
-
-    problem, size, missed = "", 0, 0
-    try:
-        from skinware.recording.files import Files
-        from skinware.recording.recorder import Recorder
-        from skinware_drivers.doctor.report import Disguise
-
-        target = Files(path)
-        recorder = Recorder(target, names=[driver], namespace=namespace, with_wires=True, disguise=Disguise())
-        threading.Thread(target=_end_with_input, args=(recorder,), daemon=True).start()
-        _say(ready=True)
+    Yields:
+        The result: at the end, ``bytes``, ``missed`` and ``problem``.
+    """
+    if path.exists():
+        raise ConfigurationError(f"{path}: exists already: give another name, or remove it")
+    what = (driver, "-o", str(path), "--namespace", namespace, "--disguise", _DISGUISE)
+    with contextlib.closing(EventProgram([*_RECORD, *what])) as recorder:
+        if not recorder.is_ready():
+            raise ConfigurationError(f"{path}: nothing can be recorded")
+        result: dict[str, Any] = {"bytes": 0, "missed": 0, "problem": "something else ended the recorder"}
         try:
-            recorder.run()
+            yield result
         finally:
-            size, missed = target.size, recorder.missed
-    except FileExistsError:
-        problem = "exists already: give another name, or remove it"
-    except (OSError, SkinwareError) as error:
-        problem = getattr(error, "strerror", None) or str(error)
-        if size:  # the driver may go on for hours
-            print(f"{path}: ended early: {problem}; the driver goes on", file=sys.stderr)  # noqa: T201
-    _say(problem=problem, bytes=size, missed=missed)
-
-
-def _end_with_input(recorder: Recorder) -> None:
-    os.read(0, 1)
-    recorder.stop()
-
-
-def _say(**what: Any) -> None:
-    with contextlib.suppress(BrokenPipeError):
-        print(json.dumps(what), flush=True)  # noqa: T201 - to the program that began this one
-
-
-if __name__ == "__main__":
-    _record(Path(sys.argv[1]), sys.argv[2], sys.argv[3])
+            recorder.close()
+            ended = recorder.events.get("stopped", {})
+            result |= {name: ended[name] for name in result if name in ended}
+            on_end(result)

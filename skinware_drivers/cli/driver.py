@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     import msgspec
 
-    from skinware_drivers.cli.capturing import Capture
     from skinware_drivers.running.news import PatchChange
     from skinware_drivers.running.runner import Runner
 
@@ -172,18 +171,18 @@ def command(
         on_ready=lambda: print_ready(runner, as_json),
         on_patches=lambda change: print_patches(runner, change) if as_json else None,
     )
-    recorder: Capture | None = None
+    result: dict[str, Any] = {}
     with contextlib.ExitStack() as beside:
         if capture is not None:
             from skinware_drivers.cli.capturing import captured
 
-            done = partial(print_capture, as_json=as_json)
-            recorder = beside.enter_context(captured(capture, setup.name, setup.namespace.name, done))
+            done = partial(print_capture, capture, as_json)
+            result = beside.enter_context(captured(capture, setup.name, setup.namespace.name, done))
         if setup.profile is not None:  # not for the recorder
             setup.profile.apply()
         with asyncio.Runner(loop_factory=FlowLoop) as loop:
             loop.run(_run(runner, as_json, partial(setup.read_again, runner)))
-    if recorder is not None and recorder.result["problem"]:
+    if result.get("problem"):
         click.get_current_context().exit(cli.EXIT_FAILED)
 
 
@@ -268,16 +267,16 @@ def print_patches(runner: Runner, change: PatchChange) -> None:
         print_json({"event": "patches", "name": runner.identity.name, **change._asdict()})
 
 
-def print_capture(capture: Capture, as_json: bool) -> None:
+def print_capture(path: Path, as_json: bool, result: Mapping[str, Any]) -> None:
     with contextlib.suppress(BrokenPipeError):
         if as_json:
-            print_json({"event": "captured", "file": str(capture.path), **capture.result})
-        elif capture.result["problem"]:
-            echo(f"{capture.path}: ended early: {capture.result['problem']}", err=True)
+            print_json({"event": "captured", "file": str(path), **result})
+        elif result["problem"]:
+            echo(f"{path}: ended early: {result['problem']}", err=True)
         else:
-            missed = f", {plural(capture.result['missed'], 'sample')} missed" if capture.result["missed"] else ""
-            size = capture.result["bytes"] / 1e6
-            echo(f"{capture.path}: {size:.1f} MB{missed}; skin-driver --bus replay:{capture.path} decodes it again")
+            missed = f", {plural(result['missed'], 'sample')} missed" if result["missed"] else ""
+            size = result["bytes"] / 1e6
+            echo(f"{path}: {size:.1f} MB{missed}; skin-driver --bus replay:{path} decodes it again")
 
 
 async def report(runner: Runner) -> None:

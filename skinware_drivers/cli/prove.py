@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import platform
 import select
 import signal
-import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -30,13 +27,11 @@ if TYPE_CHECKING:
     from skinware.driver_service import DriverReader
     from skinware.memory.namespace import Namespace
     from skinware_drivers.adapter import AnyAdapter
-    from skinware_drivers.cli.capturing import Capture
     from skinware_drivers.proving.proof import Proof, ProofFiles
     from skinware_drivers.proving.updates import Comparison
     from skinware_drivers.proving.walk import Step
 
 _STARTS_WITHIN_S = 30.0
-_ENDS_WITHIN_S = 30.0
 _DRIVER = "from skinware_drivers.cli.driver import main; main()"
 _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged": "yellow"}
 
@@ -172,8 +167,7 @@ def _captured(
             name = beside.enter_context(_started(driver_arguments, name, place, files))
         reader = beside.enter_context(reader_of(place, name, "skin-prove NAME"))
         if not driver_arguments:
-            keep: Callable[[Capture], None] = lambda done: files.captured.update(done.result)  # noqa: E731
-            beside.enter_context(captured(files.capture, reader.name, place.name, keep))
+            beside.enter_context(captured(files.capture, reader.name, place.name, files.captured.update))
         yield reader
 
 
@@ -197,47 +191,18 @@ def _interrupted_once() -> Iterator[Callable[[], None]]:
 @contextlib.contextmanager
 def _started(arguments: Sequence[str], name: str | None, place: Namespace, files: ProofFiles) -> Iterator[str]:
     """Run a driver that captures while the block runs, and yield its name."""
+    from skinware_drivers.cli.capturing import EventProgram
+
     more = [*(["--name", name] if name else []), "--namespace", place.name, "--capture", str(files.capture), "--json"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", _DRIVER, *arguments, *more],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        text=True,
-        start_new_session=True,  # Ctrl-C ends the walk, which ends it
-    )
-    ready: dict[str, Any] = {}
-    is_ready = threading.Event()
-
-    def listen() -> None:
-        assert process.stdout is not None  # noqa: S101 - it is a pipe
-        for line in process.stdout:
-            try:
-                event = dict(json.loads(line))
-            except (ValueError, TypeError):  # its code has printed something else
-                continue
-            if event.get("event") == "ready":
-                ready.update(event)
-                is_ready.set()
-            elif event.get("event") == "captured":
-                files.captured.update(event)
-        is_ready.set()
-
-    thread = threading.Thread(target=listen, daemon=True)
+    program = EventProgram(["-c", _DRIVER, *arguments, *more], signal.SIGINT)
     try:
-        thread.start()
-        if not is_ready.wait(_STARTS_WITHIN_S) or not ready:
+        if not program.is_ready(_STARTS_WITHIN_S):
             attach = f"; {files.capture} holds the frames on its buses: attach it" if files.capture.exists() else ""
             raise DriverError(f"skin-driver publishes nothing{attach}" if attach else "skin-driver did not start")
-        yield str(ready["name"])
+        yield str(program.events["ready"]["name"])
     finally:
-        process.send_signal(signal.SIGINT)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(_ENDS_WITHIN_S)
-        process.kill()  # of no effect where it has ended
-        process.wait()
-        thread.join()
-        if process.stdout is not None:
-            process.stdout.close()
+        program.close()
+        files.captured.update(program.events.get("captured", {}))
 
 
 class _AtTerminal:

@@ -215,7 +215,7 @@ def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(
     assert done["about"]["ended early"].startswith("no newer sample of 'hand': its writer")
     assert "; ended early: File too large" in done["about"]["capture"]
     assert f"{tmp_path / 'proof.md'}: Is a directory" in errors
-    assert f"{tmp_path / 'proof.mcap'}: ended early: File too large; the driver goes on" in errors
+    assert f"skin-record: {tmp_path / 'proof.mcap'}: File too large" in errors
     assert str(tmp_path / "proof.json") in done["files"]
     assert json.loads((tmp_path / "proof.json").read_text())["checks"] == done["checks"]
 

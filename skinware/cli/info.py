@@ -13,7 +13,6 @@ import click
 from skinware.bridge_state import as_lines
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json, redraw, say, style, terminal_width
-from skinware.errors import ConfigurationError
 from skinware.text import (
     NO_VALUE,
     NOT_FRESH,
@@ -71,11 +70,6 @@ def command(name: str | None, sensors: bool, health: bool, watch: bool, namespac
     """
     from skinware.memory.namespace import Namespace
 
-    if name is not None and name.endswith(".mcap"):
-        raise ConfigurationError(
-            f"{name} is a recording, and skin-info shows what runs. skin-view {name} shows it, skin-replay {name}"
-            f" publishes it again, skin-convert {name} --to npz writes it for numpy (csv, parquet, lerobot, ros2 ...)"
-        )
     place = Namespace(namespace)
     if health:
         from skinware.cli._report import show

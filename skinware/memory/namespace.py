@@ -29,6 +29,11 @@ def check_name(name: str, what: str) -> str:
     Raises:
         ConfigurationError: it cannot; the message says what can.
     """
+    if name.endswith(".mcap"):
+        raise ConfigurationError(
+            f"{name} is a recording, and runs nowhere: skin-view {name} shows it, skin-replay {name} publishes it"
+            f" again, skin-convert {name} --to npz writes it for numpy (csv, parquet, lerobot, ros2 ...)"
+        )
     if not is_name(name):
         raise ConfigurationError(
             f"{what} name {name!r}: give 1 to 47 letters, digits, '_' or '-', beginning with a letter or digit"

@@ -325,7 +325,7 @@ def test_announcements_that_are_too_many_are_told(namespace: Namespace, capsys: 
     [
         (["nobody"], 1, "no service 'nobody'"),
         (["a/b"], 2, "service name 'a/b'"),
-        (["walk.mcap"], 2, "walk.mcap is a recording, and skin-info shows what runs. skin-view walk.mcap shows it"),
+        (["walk.mcap"], 2, "walk.mcap is a recording, and runs nowhere: skin-view walk.mcap shows it"),
         (["--namespace", "a b"], 2, "namespace name 'a b'"),
         (["--sensors"], 2, "give its NAME"),
         (["nobody", "--sensors"], 1, "no service 'nobody'"),

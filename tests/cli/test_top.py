@@ -76,11 +76,18 @@ def test_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "status"), [(["-T", "nan"], 2), (["--namespace", "a/b"], 2), (["--nonsense"], 2), (["a name"], 2)]
+    ("arguments", "words"),
+    [
+        (["-T", "nan"], "not a number of seconds"),
+        (["--namespace", "a/b"], "namespace name 'a/b'"),
+        (["--nonsense"], "--nonsense"),
+        (["a name"], "driver name 'a name'"),
+        (["./walk.mcap"], "skin-top: ./walk.mcap is a recording, and runs nowhere: skin-view ./walk.mcap shows it"),
+    ],
 )
-def test_mistakes(arguments: list[str], status: int, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status(command, ["--plain", *arguments]) == status
-    assert "Traceback" not in capsys.readouterr().err
+def test_mistakes(arguments: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_status(command, ["--plain", *arguments]) == 2
+    assert words in capsys.readouterr().err
 
 
 def test_a_namespace_that_cannot_be_read_fails(namespace: Namespace, capsys: pytest.CaptureFixture[str]) -> None:

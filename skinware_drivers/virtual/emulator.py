@@ -38,10 +38,12 @@ _REACH, _STROKE = 2.2, 1.0
 _COARSEST = 0.25
 """Most that a row or column counts; a pad is 1 wide."""
 _GOLDEN = 0.618
+_FINGERS, _ONE_HAND = 3, 5
+"""Pads that are pressed at once where there are as many as on a hand; of fewer pads, one is."""
 
 
 class WanderingPress:
-    """A finger that presses one pad of a device after another, each time somewhere else, and strokes it a little.
+    """Fingers that press one pad of a device after another, each time somewhere else, and stroke them a little.
 
     Args:
         number: of the device; devices with other numbers feel other presses.
@@ -63,13 +65,15 @@ class WanderingPress:
         if since_s <= 0 or press >= _PRESSES or moment_s >= _PRESS_S:
             return strength
         presses = int(rounds) * _PRESSES + int(press)
-        pad = self._pads[presses % len(self._pads)]
-        at = (self._phase + presses * _GOLDEN) % 1
-        away = self._places[pad, :2] - self._places[pad[int(at * len(pad))], :2]
-        away /= np.abs(away).min(axis=0, initial=_COARSEST, where=away != 0)
-        away -= _STROKE * (2 * moment_s / _PRESS_S - 1) * np.array([math.cos(9 * at), math.sin(9 * at)])
+        count = len(self._pads)
         ramp = min(min(moment_s, _PRESS_S - moment_s) / _RAMP_S, 1.0)
-        strength[pad] = ramp * np.maximum(0, 1 - (away**2).sum(axis=1) / _REACH**2)
+        for number in range(presses, presses + count, -(-count // (_FINGERS if count >= _ONE_HAND else 1))):
+            pad = self._pads[number % count]
+            at = (self._phase + number * _GOLDEN) % 1
+            away = self._places[pad, :2] - self._places[pad[int(at * len(pad))], :2]
+            away /= np.abs(away).min(axis=0, initial=_COARSEST, where=away != 0)
+            away -= _STROKE * (2 * moment_s / _PRESS_S - 1) * np.array([math.cos(9 * at), math.sin(9 * at)])
+            strength[pad] = ramp * np.maximum(0, 1 - (away**2).sum(axis=1) / _REACH**2)
         return strength
 
 

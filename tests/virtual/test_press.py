@@ -53,16 +53,19 @@ def test_places_without_pads_are_one_pad() -> None:
     assert press.strength(2.0).max() > 0.9
 
 
-def test_each_press_of_a_hand_is_one_contact_with_one_identity() -> None:
+def test_three_fingers_press_a_hand_at_once_each_is_a_contact_with_one_identity() -> None:
     grid, hand = Grid(12, 6), Hand("right")
     at = [
         grid.at(hand.down(finger, [grid])[0], ["force"], range(72 * n, 72 * n + 72)) for n, finger in enumerate(FINGERS)
     ]
     places, press = Geometry.joined(at), WanderingPress(0, 1, on_pads(*[(72, 6)] * 5))
-    contacts, most, identities = Contacts(len(places), neighbours(places), places), 0, set[int]()
+    contacts = Contacts(len(places), neighbours(places), places)
+    together, pads, identities = set[int](), set[int](), set[int]()
     for number in range(20 * 30):
         load = np.rint(200 * press.strength(number / 20))
         found = contacts.update(load, load > 4, number * 50_000_000)
-        most = max(most, len(found))
+        together.add(len(found))
+        pads.add(len(set((np.flatnonzero(load > 4) // 72).tolist())))
         identities |= set(found.id.tolist())
-    assert (most, identities) == (1, set(range(1, 7)))
+    assert together == pads == {0, 3}
+    assert identities == set(range(1, 19))

@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import Page
 
 from skinware_drivers.testing.waiting import wait_until
-from tests.browser.browsing import DRIVER, PHONE, Troubles, look, tell, until
+from tests.browser.browsing import DRIVER, PHONE, Troubles, look, role, tell, until
 from tests.browser.fake_server import FakeDriver, FakeServer
 
 OpenPage = Callable[..., Page]
@@ -39,10 +39,6 @@ def page(server: FakeServer, open_page: OpenPage) -> Page:
 
 def asked(server: FakeServer, op: str) -> list[dict[str, Any]]:
     return [one for one in server.ops if one["op"] == op]
-
-
-def role(name: str, more: str = "") -> str:
-    return f"[data-role={name}]{more}"
 
 
 def test_a_silent_server_is_told_and_left_for_a_new_connection(page: Page, server: FakeServer) -> None:

@@ -4,7 +4,7 @@ import { DIMMED, MARKS } from "./marks.js";
 import { ramp } from "./palette.js";
 
 /** @param {object} parts of main.js. */
-export function hooks({ skin, stage, tree, probes, names, rewind, replay, past, view, now, wipe, contacts, plotting }) {
+export function hooks({ skin, stage, tree, probes, labels, rewind, replay, past, view, now, wipe, contacts, plotting }) {
   const pairOf = ({ sheet, i }) => [sheet.driver.id, sheet.index[i]];
   return {
     get connected() { return now.isAlive; },
@@ -14,7 +14,7 @@ export function hooks({ skin, stage, tree, probes, names, rewind, replay, past, 
     },
     get problems() { return now.problems.map(({ text }) => text); },
     get contacts() { return contacts().map(({ of, ...contact }) => contact); },
-    get names() { return names.place(stage).map(({ text, x, y, alpha, width }) => ({ text, x, y, alpha, width })); },
+    get names() { return labels().map(({ text, x, y, alpha, width }) => ({ text, x, y, alpha, width })); },
     get plots() { return plotting.strips.state; },
     get marks() { return plotting.marks; },
     get wipe() { return wipe.progress && { of: wipe.progress.of, touched: wipe.progress.touched, running: wipe.isRunning }; },

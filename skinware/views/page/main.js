@@ -15,7 +15,7 @@ import { Link, PROTOCOL } from "./link.js";
 import { fetchMeshes } from "./meshes.js";
 import { Moving } from "./moving.js";
 import { Grip, labelAt, Names } from "./names.js";
-import { Overlay } from "./overlay.js";
+import { Overlay, ringOf } from "./overlay.js";
 import { pick } from "./picking.js";
 import { Plotting } from "./plotting.js";
 import { savePicture, showRecording } from "./keeping.js";
@@ -73,7 +73,7 @@ const stage = new Stage(byId("stage"), {
     overlay.draw(its, {
       theme: view.theme,
       normals: view.normals,
-      names: view.names ? names.place(its) : [],
+      names: labels(),
       contacts: contacts(),
       hovered: probes.hovered,
       pins: probes.pins.filter(({ sheet }) => its.sheets.includes(sheet)),
@@ -254,6 +254,11 @@ function show() {
 function contacts() {
   const shown = stage.sheets.filter(({ driver }) => !driver.isOld || rewind.isPaused);
   return shown.flatMap(({ driver, shown: { contacts = [] } }) => contacts.map((one) => ({ ...one, of: driver })));
+}
+
+/** The names in the picture, as Names.place makes them. */
+function labels() {
+  return view.names ? names.place(stage, contacts().map((one) => ringOf(stage, one))) : [];
 }
 
 /** Bring everything beside the picture up to date. */
@@ -476,12 +481,12 @@ function keep() {
 
 onPointer(byId("stage"), {
   over: (x, y) => {
-    if (x !== null) grip.show(view.names && labelAt(names.place(stage), x, y));
+    if (x !== null) grip.show(labelAt(labels(), x, y));
     hover(x === null ? null : pick(stage, stage.sheets, x, y));
     cards.place(x, y);
   },
   click: (x, y) => {
-    const label = view.names && labelAt(names.place(stage), x, y);
+    const label = labelAt(labels(), x, y);
     if (label) return plotting.strips.add(plotting.part(label.part));
     const found = pick(stage, stage.sheets, x, y);
     if (found) pin(found);
@@ -546,7 +551,7 @@ onKeys({
   "?": clicks.help,
 });
 
-window.skin = hooks({ skin, stage, tree, probes, names, rewind, replay, past, view, now, wipe, contacts, plotting });
+window.skin = hooks({ skin, stage, tree, probes, labels, rewind, replay, past, view, now, wipe, contacts, plotting });
 setTheme(view.theme, false);
 look();
 addEventListener("hashchange", () => location.reload()); // another address was typed

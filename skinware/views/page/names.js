@@ -96,8 +96,8 @@ export class Names {
     this.hold();
   }
 
-  /** The names of a picture, none over another: [{text, x, y, alpha}], x and y of its middle, CSS pixels. */
-  place(stage) {
+  /** The names of a picture, none over another, no pad's over a ring: [{text, x, y, alpha}], of its middle, CSS pixels. */
+  place(stage, rings) {
     const eye = stage.camera.position.toArray();
     const placed = [];
     for (const part of this.#parts) {
@@ -122,6 +122,7 @@ export class Names {
         const x = Math.max(width / 2 + 4, Math.min(middle, stage.width - width / 2 - 4));
         const label = { part, text, width, alpha, x, y: top - LINE * line };
         if (label.y < LINE / 2 || placed.some((other) => areOver(label, other))) continue;
+        if (!part.size && rings.some((ring) => isOn(label, ring))) continue;
         placed.push(label);
         break;
       }
@@ -186,6 +187,12 @@ function groups(items, keyOf) {
   const found = new Map();
   for (const item of items) found.set(keyOf(item), [...(found.get(keyOf(item)) ?? []), item]);
   return found;
+}
+
+/** Whether a name covers some of a ring, or of what is in it. */
+function isOn({ x, y, width }, ring) {
+  const [right, down] = [Math.abs(x - ring.x) - width / 2, Math.abs(y - ring.y) - LINE / 2].map((far) => Math.max(far, 0));
+  return Math.hypot(right, down) < ring.size;
 }
 
 export function areOver(one, other) {

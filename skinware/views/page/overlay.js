@@ -83,14 +83,13 @@ export class Overlay {
   }
 
   #contact(stage, contact, labels) {
-    const at = contact.at;
-    const [x, y, depth] = stage.project(...at);
-    if (depth <= 0) return;
+    const { at } = contact;
+    const { x, y, size } = ringOf(stage, contact);
+    if (!size) return;
     const { context } = this;
     const eye = stage.camera.position.toArray();
     const normal = contact.normal ?? [0, 0, 0];
     const isAway = normal.reduce((sum, n, c) => sum + n * (eye[c] - at[c]), 0) < 0;
-    const size = Math.max(10, (Math.sqrt((contact.area_m2 || 0) / Math.PI) * stage.pixels) / depth);
     context.globalAlpha = isAway ? HIDDEN : 1;
     context.beginPath();
     context.arc(x, y, size, 0, 2 * Math.PI);
@@ -161,6 +160,12 @@ export class Overlay {
     context.fillStyle = this.ground;
     context.fillText(text, x, y + 0.5);
   }
+}
+
+/** The ring of a contact in the picture, CSS pixels; its size is 0 behind the eye. */
+export function ringOf(stage, { at, area_m2 }) {
+  const [x, y, depth] = stage.project(...at);
+  return { x, y, size: depth > 0 && Math.max(10, (Math.sqrt((area_m2 || 0) / Math.PI) * stage.pixels) / depth) };
 }
 
 function facing(stage, sheet, i) {

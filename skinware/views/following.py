@@ -145,7 +145,7 @@ class ShownDriver:
         self.newest: Newest | None = None
         self.structure, self.generation = live.structure, live.reader.generation
         self.quantities = quantities_of(self.structure)
-        self.past, self.rest = RecentValues(self.structure.n_sensors, self.structure.dtype), DriverRest(self.structure)
+        self.past, self.rest = RecentValues(self.structure), DriverRest(self.structure)
 
     @property
     def name(self) -> str:
@@ -183,8 +183,7 @@ class ShownDriver:
         if frame.structure is not self.structure and frame.structure != self.structure:
             self.structure, self.generation = frame.structure, frame.generation
             self.quantities = quantities_of(self.structure)
-            self.past = RecentValues(self.structure.n_sensors, self.structure.dtype)
-            self.rest = DriverRest(self.structure)
+            self.past, self.rest = RecentValues(self.structure), DriverRest(self.structure)
         self.taken_ns, self.life = now_ns(), LIVE
         self.past.add(frame.values, frame.published_ns)
         at_ns = None if self.origin.recording is None else frame.published_ns  # it may have been paused meanwhile

@@ -106,8 +106,8 @@ class DriverRest:
 
 
 class RecentValues:
-    def __init__(self, n: int, dtype: npt.DTypeLike) -> None:
-        self._values: npt.NDArray[Any] = np.zeros((_FRAMES, n), dtype)
+    def __init__(self, structure: Structure) -> None:
+        self._values: npt.NDArray[Any] = np.zeros((_FRAMES, structure.n_sensors), structure.dtype)
         self._time_ns = np.zeros(_FRAMES, np.int64)
         self._count = 0
 

@@ -8,6 +8,7 @@ import json
 import sys
 import time
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -187,12 +188,9 @@ class ReplayControl:
         driver = self._replayed or next(candidates, None)
         if driver is None:
             return
-        if driver is self._replayed:
-            self._asked = _Question(driver, _STATE, {}, self._hear, lambda _: self._forget(driver))
-        else:
-            self._asked = _Question(
-                driver, OPERATIONS, {}, lambda found: self._learn(driver, found), lambda _: self._forget(driver)
-            )
+        is_known = driver is self._replayed
+        operation, hear = (_STATE, self._hear) if is_known else (OPERATIONS, partial(self._learn, driver))
+        self._asked = _Question(driver, operation, {}, hear, lambda _: self._forget(driver))
 
     def act(self, action: str, value: int | float | bool | None, complain: Callable[[str], object]) -> None:
         if self._replayed is None:

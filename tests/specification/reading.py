@@ -53,9 +53,12 @@ def read_updates(
             missing[complete] = ~found
             sensors[:, columns][missing] = n_sensors
             unreadable = np.append(unreadable, complete[failed])
+            values[:, columns] = raw
         else:
-            raw = _read(kind, payload)
-        values[:, columns] = raw
+            runs = [payload[:, :0], *(_read_run(run, payload) for run in kind.frame.runs)]
+            with np.errstate(invalid="ignore"):  # a signaling NaN
+                raw = np.concatenate(runs, axis=1)
+            values[:, columns] = np.concatenate(runs, axis=1, dtype=values.dtype, casting="unsafe")
         _flag(kind, payload, length, raw, status, columns, assembly.channels)
     nowhere = np.append(orphans, unreadable) if len(unreadable) else orphans
     sensors[nowhere] = n_sensors
@@ -73,18 +76,6 @@ def name_modules(kind: FrameKind, entry: Indices, payload: Bytes, n_modules: int
     return np.where(found >= 0, found, entry)
 
 
-def _read(kind: FrameKind, payload: Bytes) -> npt.NDArray[Any]:
-    """Return (n, width) values of n frames, in the frame's own dtype.
-
-    Args:
-        payload: (n, size) uint8.
-    """
-    runs = [_read_run(run, payload) for run in kind.frame.runs]
-    if not runs:
-        return payload[:, :0]
-    return runs[0] if len(runs) == 1 else np.concatenate(runs, axis=1)
-
-
 def _flag(
     kind: FrameKind,
     payload: Bytes,
@@ -99,7 +90,7 @@ def _flag(
     Args:
         payload: (n, size) uint8.
         length: (n,) uint8.
-        raw: (n, width) what ``_read`` returned.
+        raw: (n, width) values, in a dtype that holds those of all runs.
         status: (n, all) uint8, of all values of the update.
         columns: where this frame's values are among them.
         channels: (all,) channel of each of them.

@@ -137,6 +137,8 @@ def _compare(expected: Mapping[str, object], found: Mapping[str, object], where:
         other = found[name]
         if isinstance(value, np.ndarray) and isinstance(other, np.ndarray):
             is_same = value.dtype == other.dtype and value.shape == other.shape and value.tobytes() == other.tobytes()
+            if not is_same and value.dtype.kind == "f" and np.array_equal(value, other, equal_nan=True):
+                where += "only bits of NaN or signs of 0 differ: "
         else:
             is_same = value == other
         if not is_same:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import struct
 from collections import Counter
@@ -199,14 +200,10 @@ class ModbusAdapter(Adapter[OptionsT]):
 
     async def find_unit(self, link: Link, units: Sequence[int], address: int) -> int:
         """Return the first of these units that answers a question for a register, or refuses it; else the last one."""
-        for unit in units[:-1]:
-            try:
-                await self.read(link, address, unit=unit)
-            except HandshakeTimeout:
-                continue
-            except ModbusException:
-                pass
-            return unit
+        for unit in np.repeat(units[:-1], 2).tolist():  # an answer that is lost must not lead to another device
+            with contextlib.suppress(HandshakeTimeout):
+                await self.read_or_none(link, address, unit=unit)
+                return int(unit)
         return units[-1]
 
     async def write(self, link: Link, address: int, values: Sequence[int], *, unit: int = 1) -> None:

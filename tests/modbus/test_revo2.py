@@ -6,12 +6,13 @@ import asyncio
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
 
 from skinware import DriverReader, DriverSnapshot
-from skinware.errors import BusError, ConfigurationError
+from skinware.errors import BusError, ConfigurationError, HandshakeTimeout
 from skinware.status import Status
 from skinware_drivers.description import assemble
 from skinware_drivers.link import Link
@@ -279,6 +280,13 @@ def test_operations_write_what_the_makers_program_writes(
     asyncio.run(getattr(driver, operation)(Link(make_bus("modbus:/dev/null")), []))
     address, count = registers
     assert written == [(address, [1] * count, 127)]
+
+
+@pytest.mark.parametrize(("lost", "unit"), [(0, 126), (1, 126), (2, 127)])
+def test_a_lost_answer_does_not_make_it_read_the_other_hand(lost: int, unit: int) -> None:
+    driver, link = adapter(), Link(make_bus("modbus:/dev/null"))
+    driver.read = AsyncMock(side_effect=[*[HandshakeTimeout("lost")] * lost, np.zeros(1)])  # type: ignore[method-assign]
+    assert asyncio.run(driver.find_unit(link, (126, 127), 0)) == unit
 
 
 def test_an_edition_without_a_reset_says_so() -> None:

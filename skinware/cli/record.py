@@ -224,16 +224,17 @@ class _Progress:
         is_complete = not problem
         self._news()
         messages, files = self._recorder.messages, [str(path) for path in self._target.paths]
-        absent = [name for name in self._names if not any(channel.split("/")[2:3] == [name] for channel in messages)]
+        expected = () if self._is_past else self._names  # which forgets those that appeared too early
+        absent = [name for name in expected if not any(channel.split("/")[2:3] == [name] for channel in messages)]
         why = f"{', '.join(absent)} did not appear in namespace {self._namespace!r}"
-        is_empty = is_complete and not self._is_past and len(absent) == len(self._names) > 0
-        if absent and not self._is_past and not is_empty:
+        is_in_vain = is_complete and bool(expected) and len(absent) == len(expected)
+        if absent and not is_in_vain:
             cli.warn(why)
         if self._as_json:
             with contextlib.suppress(BrokenPipeError):
                 ends = {"file": (files or [""])[-1], "files": files, "is_complete": is_complete, "problem": problem}
                 print_json({"event": "stopped", **ends, **self._figures(messages)})
-        if is_empty:
+        if is_in_vain:
             raise ServiceNotFound(why)
         if self._as_json:
             return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,21 +13,16 @@ import numpy as np
 import numpy.typing as npt
 
 from skinware._columns import Index, as_index, texts
-from skinware.bridge.messages import Service, Wish
+from skinware.bridge.messages import Service
 from skinware.bridge.streaming import FrameStream
-from skinware.errors import BadRecording, BridgeError, StructureError
+from skinware.errors import BadRecording, StructureError
 from skinware.memory.file_layout import SLOT
 from skinware.memory.ring import Sample
 from skinware.memory.schema import Schema
-from skinware.realtime import NS_PER_S, now_ns
 from skinware.structure import Structure
 from skinware.tactile.regions import SensorChoice
 from skinware.text import names_in_patches
 from skinware.transfer.generation import Generation, RecordedDriverSnapshot
-
-_KEPT_NS = 10 * NS_PER_S
-"""How long a part is kept after the last question for it."""
-_MOST_PARTS = 64
 
 
 @dataclass
@@ -135,30 +129,35 @@ def _structure(
 
 
 class RobotPart:
-    """Some sensors of the drivers of a robot; ``stream_of`` makes the stream of a service."""
+    """Some sensors of the drivers of a robot; ``stream_of`` makes the stream of a service.
+
+    One thread calls ``fit``, ``expire`` and ``close``; others may call ``take`` and ``find`` meanwhile.
+
+    Attributes:
+        asked_ns: when a peer asked for it last.
+    """
 
     def __init__(self, choice: SensorChoice, stream_of: Callable[[str], FrameStream]) -> None:
         self.choice, self._stream_of = choice, stream_of
-        self._lock = threading.Lock()
+        self.asked_ns: int = 0
         self._cuts: dict[str, tuple[Generation, Cut | None]] = {}  # by service, each with the whole generation
         self._streams: dict[str, FrameStream] = {}
 
     def fit(self, name: str, whole: Generation) -> bool:
         """Follow a driver to a generation; return whether that has any of the sensors."""
-        with self._lock:
-            known, cut = self._cuts.get(name, (None, None))
-            if known is not whole:
-                cut = None
-                structure = whole.structure
-                nothing = np.zeros(0, np.int64)
-                wanted = nothing if structure is None else np.flatnonzero(self.choice.of(name, structure))
-                if len(wanted):
-                    cut = Cut(whole, wanted)
-                    stream = self._streams.get(name) or self._stream_of(name)
-                    stream.begin(cut.generation.generation, cut.generation.coded, cut.frame)
-                    self._streams[name] = stream
-                self._cuts[name] = whole, cut
-            return cut is not None
+        known, cut = self._cuts.get(name, (None, None))
+        if known is not whole:
+            cut = None
+            structure = whole.structure
+            nothing = np.zeros(0, np.int64)
+            wanted = nothing if structure is None else np.flatnonzero(self.choice.of(name, structure))
+            if len(wanted):
+                cut = Cut(whole, wanted)
+                stream = self._streams.get(name) or self._stream_of(name)
+                stream.begin(cut.generation.generation, cut.generation.coded, cut.frame)
+                self._streams[name] = stream
+            self._cuts[name] = whole, cut
+        return cut is not None
 
     def take(self, name: str, frame: Sample) -> None:
         """Send the sensors of this part of a driver's frame, if the frame is of the known generation."""
@@ -171,53 +170,10 @@ class RobotPart:
         return None if cut is None else (cut.file, self._streams[name])
 
     def expire(self) -> None:
-        for stream in list(self._streams.values()):
+        for stream in self._streams.values():
             stream.expire()
 
     def close(self) -> None:
-        with self._lock:
-            self._cuts.clear()
-            for stream in self._streams.values():
-                stream.close()
-
-
-class Parts:
-    """All parts that peers want now; ``stream_of`` makes the stream of (service, number of the wish)."""
-
-    def __init__(self, stream_of: Callable[[str, str], FrameStream]) -> None:
-        self._stream_of = stream_of
-        self._lock = threading.Lock()
-        self._parts: dict[str, RobotPart] = {}
-        self._asked_ns: dict[str, int] = {}
-
-    def wanted(self, wish: Wish) -> RobotPart:
-        """Return the part of a wish that came now; BridgeError if there are too many."""
-        number = wish.number
-        with self._lock:
-            part = self._parts.get(number)
-            if part is None:
-                if len(self._parts) >= _MOST_PARTS:
-                    raise BridgeError(f"{_MOST_PARTS} other parts of it are wanted already")
-                part = RobotPart(wish.choice(), lambda service: self._stream_of(service, number))
-                self._parts[number] = part
-            self._asked_ns[number] = now_ns()
-            return part
-
-    def find(self, number: str, name: str) -> tuple[ServiceFile, FrameStream] | None:
-        part = self._parts.get(number)
-        return None if part is None else part.find(name)
-
-    def take(self, name: str, frame: Sample) -> None:
-        for part in list(self._parts.values()):
-            part.take(name, frame)
-
-    def expire(self) -> None:
-        """End parts for which no question came lately; answer questions that waited too long."""
-        time_ns = now_ns()
-        with self._lock:
-            over = [number for number, asked_ns in self._asked_ns.items() if time_ns - asked_ns > _KEPT_NS]
-            for number in over:
-                del self._asked_ns[number]
-                self._parts.pop(number).close()
-        for part in list(self._parts.values()):
-            part.expire()
+        self._cuts.clear()
+        for stream in self._streams.values():
+            stream.close()

@@ -27,7 +27,7 @@ from skinware.bridge.messages import (
     host_name,
     read_text,
 )
-from skinware.bridge.parts import Parts, ServedService, ServiceFile
+from skinware.bridge.parts import RobotPart, ServedService, ServiceFile
 from skinware.bridge.streaming import FrameStream
 from skinware.bridge.watching import Summaries
 from skinware.errors import (
@@ -43,7 +43,7 @@ from skinware.limits import LIMITS
 from skinware.memory import segments
 from skinware.memory.namespace import Namespace
 from skinware.memory.ring import Sample
-from skinware.realtime import boot
+from skinware.realtime import NS_PER_S, boot, now_ns
 from skinware.service import ServiceReader
 from skinware.transfer.codec import CodedColumn
 from skinware.transfer.collecting import Collector
@@ -51,6 +51,9 @@ from skinware.transfer.collecting import Collector
 _LONGEST_LINE = 4096
 _MOST_FRAMES = 1024
 """Frames that wait to be coded."""
+_KEPT_NS = 10 * NS_PER_S
+"""How long a part is kept after the last question for it."""
+_MOST_PARTS = 64
 _CALLS_AT_ONCE, _MOST_CALLS, _CALL_S = 4, 64, 30.0
 _OPERATIONS_S = 1.0
 _STATES: dict[str, State] = {"restarted": "live", "found": "live"}
@@ -115,7 +118,7 @@ class Server:
         self.guard = Guard()
         self._calls = _Workers(_CALLS_AT_ONCE, _MOST_CALLS, "skinware bridge call")
         self._coding = _Workers(1, _MOST_FRAMES, "skinware bridge coding")
-        self._parts = Parts(self._stream)
+        self._parts: dict[str, RobotPart] = {}  # by number of the wish
         self._summaries = Summaries(namespace.name, link.sender(self._keys.summary))
         self._collector = Collector(namespace, names, self)
         self._collector.take()  # the first answers have all services
@@ -140,8 +143,7 @@ class Server:
         def second() -> None:
             for served in self._services.values():
                 served.stream.expire()
-            self._parts.expire()
-            self._code_soon(lambda: self._summaries.send(self._there(), self.missed))
+            self._code_soon(self._second)
             each_second()
 
         self._collector.run(second)
@@ -184,7 +186,8 @@ class Server:
 
     def took(self, service: str, frame: Sample) -> None:
         self._services[service].stream.take(frame)
-        self._parts.take(service, frame)
+        for part in list(self._parts.values()):
+            part.take(service, frame)
 
     def happened(self, event: dict[str, Any]) -> None:
         name, state = event["service"], _STATES.get(event["event"])
@@ -208,6 +211,15 @@ class Server:
         if not self._coding.submit(self.guard.run, "a question", work, *arguments):
             self.guard.refuse("a question", f"{_MOST_FRAMES} others wait")
 
+    def _second(self) -> None:
+        """Send the summary, end parts for which no question came lately, and answer those that waited too long."""
+        self._summaries.send(self._there(), self.missed)
+        for number, part in list(self._parts.items()):
+            if now_ns() - part.asked_ns > _KEPT_NS:
+                self._parts.pop(number).close()
+            else:
+                part.expire()
+
     def _there(self) -> dict[str, ServedService]:
         with self._lock:
             return {name: replace(one) for name, one in self._services.items() if one.service.state != "closed"}
@@ -223,7 +235,12 @@ class Server:
 
     def _fit(self, wish: Wish, services: dict[str, Service]) -> str:
         """Cut a part out of all drivers and add those that have any of it to ``services``; return what is missing."""
-        part, structures = self._parts.wanted(wish), []
+        part, structures = self._parts.get(wish.number), []
+        if part is None:
+            if len(self._parts) >= _MOST_PARTS:
+                raise BridgeError(f"{_MOST_PARTS} other parts of it are wanted already")
+            part = self._parts[wish.number] = RobotPart(wish.choice(), partial(self._stream, part=wish.number))
+        part.asked_ns = now_ns()
         for name, served in self._there().items():
             driver = served.file.driver
             if driver is None or driver.structure is None:
@@ -261,10 +278,11 @@ class Server:
     def _of_service_asked(self, question: Question) -> None:
         """Answer a question for the generation or the newest frame of a service, or of a part of it."""
         name, what = question.key.split("/")[4:]
-        part, served = question.parameters.get("part"), self._services.get(name)
+        number, served = question.parameters.get("part"), self._services.get(name)
         found = None if served is None else (served.file, served.stream)
-        if part:
-            found = self._parts.find(part, name)
+        if number:
+            part = self._parts.get(number)
+            found = None if part is None else part.find(name)
         if found is None:
             question.fail(b"no such service")
         elif what == "newest":

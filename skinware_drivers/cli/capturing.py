@@ -65,6 +65,7 @@ class EventProgram:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
+            errors="replace",
             start_new_session=True,
         )
         self._thread = threading.Thread(target=self._listen, daemon=True)

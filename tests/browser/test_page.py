@@ -10,12 +10,11 @@ import pytest
 from playwright.sync_api import Page
 
 from skinware_drivers.testing.waiting import wait_until
-from tests.browser.browsing import DRIVER, PHONE, Troubles, look, role, tell, until
+from tests.browser.browsing import DRIVER, PHONE, READY, Troubles, look, role, tell, until
 from tests.browser.fake_server import FakeDriver, FakeServer
 
 OpenPage = Callable[..., Page]
 LEGEND = "document.querySelector('#scaling').innerText"
-READY = "skin.connected && skin.drawn > 2 && skin.drivers.length"
 
 
 @pytest.fixture

@@ -96,6 +96,17 @@ def test_no_pad_is_named_over_a_contact(tell: Callable[..., Any]) -> None:
         assert set(names) - left == ({"index pad"} if is_over else set()), ring
 
 
+WIDTH = """(() => {
+    const { prototype } = CanvasRenderingContext2D, { measureText } = prototype;
+    prototype.measureText = ({ length }) => ({ width: length ** 2 });
+    try { return m.widthOf("\u0416".repeat(4)); } finally { prototype.measureText = measureText; }
+})()"""
+
+
+def test_a_browser_measures_characters_not_texts_which_it_would_remember(tell: Callable[..., Any]) -> None:
+    assert tell("names.js", WIDTH) == 4
+
+
 TURN = """(() => {
     const text = new TextEncoder().encode(a[0]);
     const bytes = new Uint8Array(a[1] + 24);

@@ -199,11 +199,15 @@ export function areOver(one, other) {
   return Math.abs(one.y - other.y) < LINE && Math.abs(one.x - other.x) < (one.width + other.width) / 2 + 4;
 }
 
+/** The width of a text in FONT, pixels: that of its characters, since a browser keeps what it knows of any other text. */
 export function widthOf(text) {
-  if (!widths.has(text)) {
-    if (widths.size > 10_000) widths.clear();
+  return [...text].reduce((sum, character) => sum + widthOfOne(character), 0);
+}
+
+function widthOfOne(character) {
+  if (!widths.has(character)) {
     ruler.font = FONT;
-    widths.set(text, ruler.measureText(text).width);
+    widths.set(character, ruler.measureText(character).width);
   }
-  return widths.get(text);
+  return widths.get(character);
 }

@@ -152,7 +152,7 @@ export class Overlay {
     context.font = FONT;
     context.textAlign = "center";
     context.textBaseline = "middle";
-    const half = Math.max(8, context.measureText(text).width / 2 + 5);
+    const half = Math.max(8, widthOf(text) / 2 + 5);
     context.beginPath();
     context.roundRect(x - half, y - 8, 2 * half, 16, 8);
     context.fillStyle = this.ink;

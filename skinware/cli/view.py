@@ -136,16 +136,22 @@ def command(
         if not no_browser and has_screen:
             threading.Thread(target=webbrowser.open, args=(url,), daemon=True).start()
 
+    runner, stop = asyncio.Runner(), asyncio.Event()
+    loop = runner.get_loop()
+
+    def end() -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(stop.set)
+
     try:
-        asyncio.run(_serve(follower, access, RecordingFiles(files, names=names), context, host, port, ready))
+        with cli.signals_end(end), contextlib.closing(follower), runner:
+            runner.run(_serve(follower, access, RecordingFiles(files, names=names), context, host, port, stop, ready))
     except OSError as error:
         why = os.strerror(error.errno) if error.errno and error.errno > 0 else str(error.strerror or error)
         if error.errno == errno.EADDRINUSE:
             why = "in use: give another --port, or 0 for any that is free"
         echo(f"skin-view: {host}, port {DEFAULT_PORT if port is None else port}: {why}", err=True)
         click.get_current_context().exit(cli.EXIT_FAILED)
-    finally:
-        follower.close()
 
 
 async def _serve(
@@ -155,15 +161,13 @@ async def _serve(
     tls: ssl.SSLContext | None,
     host: str,
     port: int | None,
+    stop: asyncio.Event,
     ready: Callable[[int], None],
 ) -> None:
     from skinware.views.programs import RECORD, DoctorProgram, RecordingProgram
     from skinware.views.server import ViewServer
 
-    stop = asyncio.Event()
-    for number in cli.ending_signals():
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    origin = follower.origins[0]
+    (origin,) = follower.origins
     namespace = origin.namespace.name
     doctor = DoctorProgram((sys.executable, "-m", "skinware_drivers.cli.doctor"), namespace)
     recording = RecordingProgram(RECORD, namespace, origin.names)

@@ -165,9 +165,6 @@ class LiveDrivers:
 
 
 class LiveBridges(Drivers[BridgeReader]):
-    def __init__(self, namespace: Namespace) -> None:
-        super().__init__(namespace, BridgeReader)
-
     def states(self) -> list[BridgeState]:
         """Return the states of living bridges, without those that cannot be read (skin-info names them)."""
         states = []
@@ -232,7 +229,7 @@ class Overview:
         self.names = names
         self.drivers = LiveDrivers(namespace, names)
         self.contacts = LiveSources[ContactsSample](namespace, ContactsReader)
-        self.bridges = LiveBridges(namespace)
+        self.bridges = LiveBridges(namespace, BridgeReader)
 
     def look(self) -> list[LiveDriver]:
         """Look for what came or went, take the newest snapshots without waiting, and return all drivers by name."""

@@ -256,8 +256,6 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[list[DriverSnap
         if is_each:
             return values
         found = np.full((len(frames), len(lines)), np.nan)
-        if not some:
-            return found
         unknown = np.isnan(values)
         values[unknown] = 0
         sums, most = (add.reduceat(values, starts, axis=1) for add in (np.add, np.maximum))

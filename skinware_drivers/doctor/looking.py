@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skinware.bridge_state import BridgeState
+from skinware.bridge_state import BridgeReader, BridgeState
 from skinware.driver_service import DriverReader
 from skinware.driver_snapshot import DriverSnapshot
 from skinware.drivers import Drivers
@@ -302,7 +302,7 @@ def look(namespace: Namespace, seconds: float, progress: Callable[[float], objec
         grown = {name: max(0, count - was.get(name, 0)) for name, count in total.items()}
         interfaces_seen.append((one, Counted(total, grown)))
     bridges: tuple[BridgeState, ...] = ()
-    with contextlib.closing(LiveBridges(namespace)) as live, contextlib.suppress(NamespaceError):
+    with contextlib.closing(LiveBridges(namespace, BridgeReader)) as live, contextlib.suppress(NamespaceError):
         live.look()
         bridges = tuple(live.states())
     return Evidence(

@@ -78,7 +78,7 @@ def test_a_state_that_is_none_is_named_and_left_out(namespace: Namespace, text: 
         (problem,) = report(namespace)["problems"]
         assert problem.startswith("service 'walle-bridge' publishes no state of a bridge (")
         assert "\n" not in problem
-        with contextlib.closing(LiveBridges(namespace)) as live:
+        with contextlib.closing(LiveBridges(namespace, BridgeReader)) as live:
             live.look()
             assert [each.robot for each in live.states()] == ["eve"]
 

@@ -78,9 +78,7 @@ def test_json(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["-T", "nan"], "not a number of seconds"),
         (["--namespace", "a/b"], "namespace name 'a/b'"),
-        (["--nonsense"], "--nonsense"),
         (["a name"], "driver name 'a name'"),
         (["./walk.mcap"], "skin-top: ./walk.mcap is a recording, and runs nowhere: skin-view ./walk.mcap shows it"),
     ],

@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import ssl
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -27,8 +28,11 @@ from tests.commands import refused, run, running
 from tests.views.client import page_of
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.thorough)])
-def test_it_serves_until_it_is_told_to_end(namespace: Namespace, number: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "is_held"),
+    [(signal.SIGINT, False), (signal.SIGINT, True), pytest.param(signal.SIGTERM, False, marks=pytest.mark.thorough)],
+)
+def test_it_serves_until_it_is_told_to_end(namespace: Namespace, number: int, is_held: bool) -> None:
     with publishing(FakeSkin("torso", fake_structure(1, 2))), publishing(FakeSkin("arm", fake_structure(1, 2))):
         with running("skin-view", "torso", "--port", "0", "--no-browser") as server:
             ready = server.wait_for("ready")
@@ -36,8 +40,14 @@ def test_it_serves_until_it_is_told_to_end(namespace: Namespace, number: int) ->
             with page_of(ready["url"]) as viewer:
                 viewer.pull_until(lambda _: viewer.skin["drivers"])
                 assert [driver["name"] for driver in viewer.skin["drivers"]] == ["torso"]
+                while is_held and server.process.poll() is None:
+                    server.process.send_signal(number)
+                    time.sleep(0.001)  # without a pause they are few
                 assert server.stop(number) == {}
-                assert (server.process.returncode, server.errors) == (0, "")
+                assert server.errors == ""
+                assert server.process.returncode in (
+                    [0, -number] if is_held else [0]
+                )  # at last it is the interpreter's
 
 
 def test_its_address_for_people(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

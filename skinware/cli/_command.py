@@ -197,7 +197,8 @@ def refuse_others(option: str, allowed: Collection[str]) -> None:
 
 def warn(text: str) -> None:
     """Print one line on stderr under the running command's name: a note that is no error."""
-    echo(f"{click.get_current_context().info_name}: {text}", err=True)
+    context = click.get_current_context(silent=True)  # of the main thread alone
+    echo(f"{context.info_name if context else os.path.basename(sys.argv[0])}: {text}", err=True)
 
 
 def echo_changes(shown: dict[str, str], states: Mapping[str, str]) -> None:

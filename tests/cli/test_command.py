@@ -5,6 +5,7 @@ import json
 import queue
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import click
 import pytest
@@ -108,10 +109,12 @@ def test_json_is_one_line_that_every_program_can_read(capsys: pytest.CaptureFixt
     }
 
 
-def test_warnings_name_the_command(capsys: pytest.CaptureFixture[str]) -> None:
-    with click.Context(command_that(), info_name="skin-try"):
+def test_warnings_name_the_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/bin/skin-try"])
+    with click.Context(command_that(), info_name="skin-try"), ThreadPoolExecutor() as pool:
         warn("it came back")
-    assert capsys.readouterr() == ("", "skin-try: it came back\n")
+        pool.submit(warn, "in a thread").result()
+    assert capsys.readouterr() == ("", "skin-try: it came back\nskin-try: in a thread\n")
 
 
 def test_a_signal_that_interrupts_the_holder_of_a_lock_ends_the_command() -> None:

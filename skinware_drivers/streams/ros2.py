@@ -229,7 +229,9 @@ class Ros2Driver(DdsAdapter[Ros2Options]):
         if not isinstance(self._line, TopicBus):
             return why
         heard = self._line.heard()
-        others = [f"{_in_ros(one.topic)} ({one.ros_type or one.type_name})" for one in heard if one.topic in names]
+        known = {(topic.name, topic.dds_type) for topic in self.topics}
+        strange = [one for one in heard if one.topic in names and (one.topic, one.type_name) not in known]
+        others = [f"{_in_ros(one.topic)} ({one.ros_type or one.type_name})" for one in strange]
         if others:
             return f"{why}; {', '.join(others)}: a type that is not known needs a map (operation write_map)"
         listed = [f"{_in_ros(one.topic)} ({one.ros_type})" for one in heard if one.ros_type][:_MOST_LISTED]

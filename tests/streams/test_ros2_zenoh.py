@@ -24,7 +24,7 @@ from skinware.ros2.rmw_zenoh import ZenohNode, packed_attachment
 from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos
 from skinware.status import Status
 from skinware_drivers.registry import make_bus
-from skinware_drivers.streams.dds import DdsTopic
+from skinware_drivers.streams.dds import DdsTopic, HeardTopic
 from skinware_drivers.streams.ros2 import Ros2Driver, Ros2Options
 from skinware_drivers.streams.ros2_presets import TEXTS
 from skinware_drivers.streams.ros2_zenoh import ZenohPort, ZenohTopicBus
@@ -159,6 +159,13 @@ def test_samples_that_are_lost_or_wrong_are_counted(at: Router) -> None:
         assert len(port._samples[0][2]) < 1 << 21
         assert port.read(0) == b""
         assert port.refused == 4
+
+
+def test_a_silent_topic_of_a_known_type_needs_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    driver, bus = Ros2Driver(Ros2Options(topic=("/touch",))), make_bus("ros2://0")
+    monkeypatch.setattr(bus, "heard", lambda: [HeardTopic("rt/touch", "std_msgs::msg::dds_::UInt16_", 1)])
+    monkeypatch.setattr(driver, "_line", bus, raising=False)
+    assert driver._nothing() == "no messages on /touch within 5 s; topics there: /touch (std_msgs/msg/UInt16)"
 
 
 def test_topics_are_found(at: Router) -> None:

@@ -41,13 +41,11 @@ _SETTINGS = {
     "timestamping/enabled": "true",
 }
 """As nodes of rmw_zenoh; late subscribers get only messages with time stamps."""
-_SERVICE_QOS = Qos(depth=10)
+_SERVICES = Qos(depth=10)
 _MOST_REQUESTS = 10
 """Requests that may wait, as in a node of ROS."""
 _LOOK_S = 1.0
 """Time between two looks for the router."""
-_NODE = 0
-"""Number of the only node in a session."""
 PUBLISHER, SERVICE = "MP", "SS"
 """Kinds of endpoints."""
 
@@ -87,14 +85,14 @@ class ZenohNode:
         self._at = ", ".join(places.connect)
         self._session = open_session(places)
         self._zid = str(self._session.info.zid())
-        self._numbers = itertools.count(_NODE + 1)
+        self._numbers = itertools.count(1)
         self._endpoints: set[_ZenohPublisher | _ZenohService] = set()
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._answering = threading.RLock()
         self.is_seen: bool = True
         self._worker = threading.Thread(target=self._work, name=f"node {identity.name}")
         try:
-            self._token = self._announce(node_token(identity, self._zid, _NODE))
+            self._token = self._announce(node_token(identity, self._zid))
         except BridgeError:
             self._close_session()
             raise
@@ -102,7 +100,7 @@ class ZenohNode:
 
     def publisher(self, topic: str, message_type: MessageType, qos: Qos) -> TopicPublisher:
         at = key(self._identity, topic, message_type)
-        token = self._endpoint_token(PUBLISHER, topic, message_type, qos)
+        token = endpoint_token(self._identity, self._zid, next(self._numbers), PUBLISHER, topic, message_type, qos)
         with _as_bridge_error(topic):
             declared = _declare_publisher(self._session, at, qos)
         made = _ZenohPublisher(declared, self._announce(token), gid(token), qos, self._endpoints.discard)
@@ -111,7 +109,7 @@ class ZenohNode:
 
     def service(self, name: str, service_type: ServiceType, handler: Handler) -> Callable[[], None]:
         at = key(self._identity, name, service_type)
-        token = self._endpoint_token(SERVICE, name, service_type, _SERVICE_QOS)
+        token = endpoint_token(self._identity, self._zid, next(self._numbers), SERVICE, name, service_type, _SERVICES)
         made = _ZenohService(at, handler, self._answering, self._endpoints.discard)
         with _as_bridge_error(name):
             asked = directly(lambda query: self._asked(made, query))
@@ -127,9 +125,6 @@ class ZenohNode:
         if self._worker is not threading.current_thread():
             self._worker.join()
         self._close_session()
-
-    def _endpoint_token(self, kind: str, name: str, of_type: MessageType, qos: Qos) -> str:
-        return endpoint_token(self._identity, self._zid, _NODE, next(self._numbers), kind, name, of_type, qos)
 
     def _announce(self, token: str) -> zenoh.LivelinessToken:
         with _as_bridge_error(token):
@@ -277,7 +272,6 @@ def _as_bridge_error(what: str) -> Iterator[None]:
         raise BridgeError(f"{what}: {error}") from None
 
 
-_TOKENS = "@ros2_lv"
 _NO_HASH = "TypeHashNotSupported"
 _NAME = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -323,24 +317,17 @@ def key(identity: NodeIdentity, name: str, of_type: MessageType) -> str:
     return f"{identity.domain}{name}/{of_type.dds_name}/{_hash(identity, of_type)}"
 
 
-def node_token(identity: NodeIdentity, session: str, node: int) -> str:
-    """Return the token of a node, which has a number in a session of zenoh."""
-    return "/".join((_TOKENS, str(identity.domain), session, str(node), str(node), "NN", *_of_node(identity)))
+def node_token(identity: NodeIdentity, session: str) -> str:
+    """Return the token of the only node in a session of zenoh."""
+    return _token(identity, session, 0, "NN")
 
 
 def endpoint_token(
-    identity: NodeIdentity,
-    session: str,
-    node: int,
-    endpoint: int,
-    kind: str,
-    name: str,
-    of_type: MessageType,
-    qos: Qos,
+    identity: NodeIdentity, session: str, endpoint: int, kind: str, name: str, of_type: MessageType, qos: Qos
 ) -> str:
-    """Return the token of a publisher or a service, which has a number of its own in the session."""
-    place = (_TOKENS, str(identity.domain), session, str(node), str(endpoint), kind, *_of_node(identity))
-    return "/".join((*place, name.replace("/", "%"), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
+    """Return the token of a publisher or a service, which has a number of its own in the session, from 1 on."""
+    place = _token(identity, session, endpoint, kind)
+    return "/".join((place, name.replace("/", "%"), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
 
 
 def qos_text(qos: Qos) -> str:
@@ -356,8 +343,9 @@ def gid(token: str) -> bytes:
     return xxhash.xxh3_128_digest(token.encode())[::-1]
 
 
-def _of_node(identity: NodeIdentity) -> tuple[str, str, str]:
-    return "%", identity.namespace.replace("/", "%"), identity.name
+def _token(identity: NodeIdentity, session: str, number: int, kind: str) -> str:
+    namespace = identity.namespace.replace("/", "%")
+    return f"@ros2_lv/{identity.domain}/{session}/0/{number}/{kind}/%/{namespace}/{identity.name}"
 
 
 def _hash(identity: NodeIdentity, of_type: MessageType) -> str:

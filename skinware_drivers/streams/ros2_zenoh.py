@@ -36,9 +36,7 @@ _OVERTAKEN = 64
 
 
 class ZenohOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    router: Annotated[tuple[str, ...], Meta(description="routers of zenoh, as tcp/192.168.1.10:7447")] = (
-        DEFAULT_ROUTER,
-    )
+    router: Annotated[tuple[str, ...], Meta(description="zenoh routers, as tcp/192.168.1.10:7447")] = (DEFAULT_ROUTER,)
     depth: Annotated[
         int, Meta(ge=1, le=65536, description="samples that wait to be read; further ones are dropped")
     ] = 1024
@@ -51,8 +49,7 @@ def _no_device_end(channel: str, *_: object, **_more: object) -> Bus:
 class ZenohTopicBus(TopicBus):
     """Topics of ROS 2 over rmw_zenoh. Its name is ``ros2://DOMAIN?key=value``, with the number of the domain.
 
-    It joins the graph as a session without a node. Samples that a publisher numbered and that did not come are counted
-    as dropped.
+    It joins the graph as a node with subscriptions. Samples whose numbers did not come count as dropped.
     """
 
     scheme: ClassVar[str] = "ros2"
@@ -80,6 +77,7 @@ class ZenohPort(TopicPort):
         self._tokens: deque[tuple[str, bool]] = deque(maxlen=_MOST_TOKENS)
         self._sequences: dict[str, tuple[bytes, int]] = {}
         self._ends: list[Callable[[], None]] = []
+        self._shown: set[str] = set()
         self._event = -1
         self._waking = threading.Lock()  # zenoh's threads may still wake what is being closed
         try:
@@ -109,7 +107,8 @@ class ZenohPort(TopicPort):
             if len(parts) != _TOKEN_PARTS or parts[5] != "MP":  # of something else
                 continue
             if is_there:
-                self.came(TopicSource(gid(token), f"rt{parts[9].replace('%', '/')}", parts[10], time_ns))
+                if self.came(TopicSource(gid(token), f"rt{parts[9].replace('%', '/')}", parts[10], time_ns)):
+                    self._show("/".join(parts[9:12]))
             else:
                 self.went(gid(token))
         return has_changed
@@ -151,6 +150,15 @@ class ZenohPort(TopicPort):
             with self._waking:
                 os.close(self._event)
                 self._event = -1
+
+    def _show(self, topic: str) -> None:
+        """Show a subscription in the graph: many publishers send nothing while it shows none."""
+        if topic not in self._shown:
+            place, node = f"@ros2_lv/{self._domain}/{self._link.zid}/0", f"%/%/skin_driver_{os.getpid()}"
+            if not self._shown:
+                self._link.declare_token(f"{place}/0/NN/{node}")
+            self._shown.add(topic)
+            self._link.declare_token(f"{place}/{len(self._shown)}/MS/{node}/{topic}/2::,{self._depth}:,:,:,,")
 
     def _sample(self, key: str, attachment: bytes, payload: bytes) -> None:
         """Keep a sample; called in threads of zenoh."""

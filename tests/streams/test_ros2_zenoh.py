@@ -31,6 +31,7 @@ from skinware_drivers.streams.ros2_zenoh import ZenohPort, ZenohTopicBus
 from skinware_drivers.testing.driving import emulated_skin
 from skinware_drivers.testing.waiting import read_until, wait_until
 from tests.commands import run, running
+from tests.ros2.graph_peer import peer
 from tests.ros2.router import Router, router, sockets
 from tests.ros2.sdk_peer import sdk_peer
 from tests.sdk.driving import has_come, is_whole, later_than
@@ -159,6 +160,18 @@ def test_samples_that_are_lost_or_wrong_are_counted(at: Router) -> None:
         assert len(port._samples[0][2]) < 1 << 21
         assert port.read(0) == b""
         assert port.refused == 4
+
+
+def test_the_graph_shows_one_subscription_to_all_publishers_of_a_type(at: Router) -> None:
+    """``ros2 topic pub --once`` of rmw_zenoh_cpp 0.2.10 waits for one."""
+    case = case_of("std_msgs/msg/UInt16")
+    with peer(at.endpoint, 8) as other, joined(at, 8, _topics("/touch")) as port:
+        with published(at, case, "/other", 8), published(at, case, domain=8), published(at, case, domain=8):
+            wait_until(lambda: (port.look(0), len(port.publishers))[1] == 3)
+            shown = other.wait_for("MS", "/touch")
+            assert (shown.type_hash, shown.qos[0]) == (HASH, "2")  # best effort fits all publishers
+            assert shown.node in other.found("NN")
+            assert len(port._shown) == 1
 
 
 def test_a_silent_topic_of_a_known_type_needs_no_map(monkeypatch: pytest.MonkeyPatch) -> None:

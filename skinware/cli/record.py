@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
-import os
 import pkgutil
 import re
 import signal
@@ -29,12 +28,12 @@ if TYPE_CHECKING:
     from skinware.recording.recorder import Recorder
 
 
-def _listen_until_eof(mark: Callable[[str, int], object]) -> None:
+def _listen_until_eof(recorder: Recorder) -> None:
     for line in sys.stdin:
         with contextlib.suppress(ValueError, KeyError, TypeError):
             told = json.loads(line)
-            mark(str(told["text"]), int(told["time_ns"]))
-    os.kill(os.getpid(), signal.SIGINT)  # the kernel closes it when the other program is killed
+            recorder.mark(str(told["text"]), int(told["time_ns"]))
+    recorder.stop()  # the kernel closes it when the other program is killed
 
 
 _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
@@ -143,7 +142,7 @@ def command(
     )
     report = _Progress(recorder, target, path, as_json)
     if until_eof:
-        threading.Thread(target=_listen_until_eof, args=(recorder.mark,), daemon=True).start()
+        threading.Thread(target=_listen_until_eof, args=(recorder,), daemon=True).start()
     with cli.signals_end(recorder.stop, {signal.SIGUSR1: recorder.save}):
         report.ready(names, place.name, is_past=last_s is not None)
         try:

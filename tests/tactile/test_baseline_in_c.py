@@ -87,9 +87,8 @@ def shuffled(seed: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
 
 @pytest.mark.parametrize("seed", [3, 4, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (0, 1, 2, 5))])
 def test_presses_losses_jumps_and_other_rates(seed: int) -> None:
-    random = np.random.default_rng(seed)
+    random, resolution = np.random.default_rng(seed), 0.0 if seed == 4 else 1.0
     module, patch = shuffled(seed) if seed % 2 else (np.arange(N) // 12, np.arange(N) // 48)
-    resolution = 0.0 if seed == 4 else 1.0
     both = Both(
         *(module, patch),
         signed=seed == 3,
@@ -155,16 +154,18 @@ def test_a_restored_one_goes_on_alike() -> None:
     both.compare_states()
 
 
-def test_what_is_left_of_a_load_is_forgotten_when_it_rises_again() -> None:
-    """A load that eases then is no rest of a cover that was pressed before."""
-    both, random = Both(np.zeros(12), np.zeros(12)), np.random.default_rng(3)
+def test_what_is_left_of_a_load_is_forgotten_when_it_rises_again_and_else_fades() -> None:
+    """A load that eases then is no rest of a cover that was pressed before. 3 s after the other fell, 41 are left."""
+    both, random = Both(np.arange(24) // 12, np.arange(24) // 12), np.random.default_rng(3)
     touched = []
-    for number in range(1, 1600):
-        time_s = number / 20
-        load = np.interp(time_s, [10, 10.2, 40, 40.1, 46, 46.1, 52, 72], [0, 200, 200, 20, 20, 60, 60, 10])
-        values = np.round(20 + 0.8 * random.standard_normal(12) + np.where(np.arange(12) < 2, load, 0))
-        touched.append(both.update(number * 50_000_000, values).touched[:2])
-    assert np.all(touched[20 * 12 :])
+    for number in range(1, 2200):
+        rises = np.interp(number / 20, [10, 10.2, 40, 40.1, 46, 46.1, 52, 72], [0, 200, 200, 20, 20, 60, 60, 10])
+        fades = np.interp(number / 20, [10, 10.2, 80, 80.1, 110], [0, 200, 200, 45, 5])
+        values = np.round(20 + 0.8 * random.standard_normal(24) + [rises, rises, *[0] * 20, fades, fades])
+        touched.append(both.update(number * 50_000_000, values).touched)
+    assert np.all(np.array(touched)[20 * 12 : 20 * 80, :2])
+    assert np.all(np.array(touched)[20 * 12 : 20 * 89, -2:])
+    assert not np.any(touched[20 * 92 :], axis=0)[-2:].any()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -217,8 +218,7 @@ def test_a_world_with_everything_that_goes_wrong() -> None:
     "later", [4, 7, 11, *(pytest.param(frames, marks=pytest.mark.thorough) for frames in (5, 6, 8, 9, 10))]
 )
 def test_a_module_that_is_looked_at_again_while_a_touch_begins_on_it(later: int, is_first: bool) -> None:
-    both = Both(np.zeros(12, int), np.zeros(12, int))
-    random = np.random.default_rng(later)
+    both, random = Both(np.zeros(12, int), np.zeros(12, int)), np.random.default_rng(later)
     for number in range(160):
         values = np.round(20 + 0.5 * random.standard_normal(12))
         if number >= 130:  # not at once, so that it is looked at again

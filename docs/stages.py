@@ -39,7 +39,6 @@ from skinware.tactile.health import HealthKind, HealthReport
 from skinware.tactile.health_service import HealthWriter
 from skinware.tactile.motion import MotionWriter
 from skinware.tactile.regions import Region, Regions
-from skinware.tactile.testing import Surface
 from skinware.tactile.tracking import TrackingSettings
 from skinware_drivers import Layout
 from skinware_drivers.description import Module, Patch, assemble, taxels
@@ -150,23 +149,6 @@ def end_programs() -> None:
     for process in _programs:
         process.join()
         assert process.exitcode == 0
-
-
-def structure_of(surface: Surface, places: Geometry) -> Structure:
-    """Return the structure of a driver of pressure whose sensors have the places of a board's surface."""
-    n = len(places)
-    return Structure(
-        types=[PRESSURE.measured(unit="counts")],
-        buses=["x"],
-        patch_name=["board 7"],
-        patch_bus=[0],
-        module_patch=[0] * 16,
-        module_kind=["triangle"] * 16,
-        sensor_uid=np.arange(n),
-        sensor_type=[PRESSURE.id] * n,
-        sensor_module=surface.module,
-        dtype="<f4",
-    ).placed(places)
 
 
 def decode_a_triangle(layout: Layout) -> None:

@@ -10,7 +10,8 @@ const MATCHES = {
   day: ["time of day", ({ began_s }) => -began_s],
   mark: ["first marks", (_, { events = [] }) => events.find(({ event }) => event === "mark")?.time_s],
 };
-const [BY_HAND, NEAR_S] = ["hand", 0.05];
+const BY_HAND = "hand";
+const NEAR_S = 0.2; // between matching times while both play, each that of its newest sample: two periods of a slow hand
 
 /** Pause and the slider of what was. */
 export class Rewind {

@@ -300,8 +300,8 @@ def living_inode(namespace: Namespace, name: str) -> tuple[int, int] | None:
 
 
 def _not_found(namespace: Namespace, name: str) -> str:
-    others = namespace.services()
-    there_are = nearest_name(name, others) if others else ", nor another; start a driver (skin-driver --bus ...)"
+    start = "skin-calm" if namespace.name.endswith("calm") else "a driver (skin-driver --bus ...)"
+    there_are = nearest_name(name, others) if (others := namespace.services()) else f", nor another; start {start}"
     return f"no service {name!r} in namespace {namespace.name!r}{there_are}"
 
 

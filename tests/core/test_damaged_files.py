@@ -155,8 +155,7 @@ def test_a_program_without_descriptors_is_not_given_the_file_to_blame() -> None:
 
 
 def test_symlinks_fifos_and_foreign_files_are_refused(namespace: Namespace) -> None:
-    data = ring_file(namespace)
-    path = namespace.ring_path("x")
+    data, path = ring_file(namespace), namespace.ring_path("x")
     path.symlink_to("/etc/passwd")
     with pytest.raises(BadServiceFile, match="cannot be opened"):
         ServiceReader[Sample]("x")
@@ -174,8 +173,9 @@ def test_symlinks_fifos_and_foreign_files_are_refused(namespace: Namespace) -> N
 
 
 def test_a_folder_that_cannot_be_trusted_is_refused(namespace: Namespace) -> None:
-    with pytest.raises(ServiceNotFound, match="nor another; start a driver"):
-        ServiceReader[Sample]("x")
+    for place, words in ((namespace, "a driver"), (Namespace(f"{namespace.name}-calm"), "skin-calm")):
+        with pytest.raises(ServiceNotFound, match=f"nor another; start {words}"):
+            ServiceReader[Sample]("x", namespace=place)
     namespace.create()
     namespace.path.chmod(0o2777)
     with pytest.raises(NamespaceError, match="written by others"):

@@ -150,14 +150,14 @@ def test_ports_may_be_asked_while_others_come(namespace: object, yarp: Robot, mo
         ports = there._ports
         (port,) = ports.values()
 
-        class Growing:
-            @property
-            def receivers(self) -> list[Receiver]:
-                """Add another port at this moment, as the thread of the server may."""
-                ports["/skinware/foot"] = port
-                return []
+        class Growing(list[Receiver]):
+            def __iter__(self) -> Iterator[Receiver]:
+                """Add another port while this thread asks, as that of the server may."""
+                if threading.current_thread() is threading.main_thread():
+                    ports["/skinware/foot"] = port
+                return super().__iter__()
 
-        monkeypatch.setattr(port, "port", Growing())
+        monkeypatch.setattr(port.port, "receivers", Growing())
         assert set(there.ports()) == {"/skinware/hand"}
         assert set(there.ports()) == {"/skinware/hand", "/skinware/foot"}
         monkeypatch.undo()

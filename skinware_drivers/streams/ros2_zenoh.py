@@ -49,7 +49,7 @@ def _no_device_end(channel: str, *_: object, **_more: object) -> Bus:
 class ZenohTopicBus(TopicBus):
     """Topics of ROS 2 over rmw_zenoh. Its name is ``ros2://DOMAIN?key=value``, with the number of the domain.
 
-    It joins the graph as a node with subscriptions. Samples whose numbers did not come count as dropped.
+    It joins the graph as a hidden node with subscriptions. Samples whose numbers did not come count as dropped.
     """
 
     scheme: ClassVar[str] = "ros2"
@@ -154,7 +154,7 @@ class ZenohPort(TopicPort):
     def _show(self, topic: str) -> None:
         """Show a subscription in the graph: many publishers send nothing while it shows none."""
         if topic not in self._shown:
-            place, node = f"@ros2_lv/{self._domain}/{self._link.zid}/0", f"%/%/skin_driver_{os.getpid()}"
+            place, node = f"@ros2_lv/{self._domain}/{self._link.zid}/0", f"%/%/_skin_driver_{os.getpid()}"
             if not self._shown:
                 self._link.declare_token(f"{place}/0/NN/{node}")
             self._shown.add(topic)

@@ -170,7 +170,7 @@ def test_the_graph_shows_one_subscription_to_all_publishers_of_a_type(at: Router
             wait_until(lambda: (port.look(0), len(port.publishers))[1] == 3)
             shown = other.wait_for("MS", "/touch")
             assert (shown.type_hash, shown.qos[0]) == (HASH, "2")  # best effort fits all publishers
-            assert shown.node in other.found("NN")
+            assert other.found("NN")[shown.node].node == f"/_skin_driver_{os.getpid()}"  # hidden from ros2 node list
             assert len(port._shown) == 1
 
 

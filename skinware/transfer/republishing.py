@@ -106,6 +106,8 @@ class Republisher:
             for into in (columns[column] for column in _TIMES_OF_DRIVERS if column in columns):
                 into[into != 0] += shift_ns
         acquired_ns = frame.acquired_ns + shift_ns if frame.acquired_ns else 0
+        if self._paused:
+            writer.pause()  # or a reader that looks now takes the frame for one that grows old
         writer.commit(frame.acquired_ns if self._keeps_times else acquired_ns, frame.flags)
         self._counts[name] = count
         self.frames[name] += 1

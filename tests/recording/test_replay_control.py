@@ -15,6 +15,7 @@ import skinware.recording
 from skinware import DriverReader, Namespace, Sample, ServiceReader
 from skinware.errors import Paused, RequestFailed, RequestRefused, ServiceNotFound
 from skinware.recording.replaying import Replayer
+from skinware.service import ServiceWriter
 from skinware_drivers.testing.waiting import wait_until
 from tests.cli.fake_skin import FakeSkin, fake_process, fake_structure, kill
 from tests.recording.rig import (
@@ -101,6 +102,23 @@ def test_seeking_shows_what_was_newest_then(file: Path) -> None:
             expected = newest([frame for frame in frames if frame[0] <= told["time_s"]])  # the last one, too
             state = there()
             assert {name: state[name] for name in expected} == expected
+
+
+def test_no_sample_of_a_paused_replay_is_seen_in_a_service_that_goes_on(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit, paused = ServiceWriter.commit, []
+
+    def committed(writer: ServiceWriter, acquired_ns: int, flags: int = 0) -> int:
+        paused.append(writer.paused)
+        return commit(writer, acquired_ns, flags)
+
+    monkeypatch.setattr(ServiceWriter, "commit", committed)
+    with controlling(file) as reader:
+        reader.call("seek", time_s=0.5)
+        reader.call("step", frames=3)
+    assert len(paused) > 5
+    assert all(paused)
 
 
 def test_playing_goes_on_from_there_without_a_gap(file: Path) -> None:

@@ -46,7 +46,7 @@ _MOST_REQUESTS = 10
 """Requests that may wait, as in a node of ROS."""
 _LOOK_S = 1.0
 """Time between two looks for the router."""
-PUBLISHER, SERVICE = "MP", "SS"
+PUBLISHER, SUBSCRIPTION, SERVICE = "MP", "MS", "SS"
 """Kinds of endpoints."""
 
 
@@ -317,16 +317,22 @@ def key(identity: NodeIdentity, name: str, of_type: MessageType) -> str:
     return f"{identity.domain}{name}/{of_type.dds_name}/{_hash(identity, of_type)}"
 
 
+def place_token(identity: NodeIdentity, session: str, number: int, kind: str) -> str:
+    """Return the begin of a token: the node, the session, and the kind and number of an endpoint; 0, NN: the node."""
+    namespace = identity.namespace.replace("/", "%")
+    return f"@ros2_lv/{identity.domain}/{session}/0/{number}/{kind}/%/{namespace}/{identity.name}"
+
+
 def node_token(identity: NodeIdentity, session: str) -> str:
     """Return the token of the only node in a session of zenoh."""
-    return _token(identity, session, 0, "NN")
+    return place_token(identity, session, 0, "NN")
 
 
 def endpoint_token(
     identity: NodeIdentity, session: str, endpoint: int, kind: str, name: str, of_type: MessageType, qos: Qos
 ) -> str:
     """Return the token of a publisher or a service, which has a number of its own in the session, from 1 on."""
-    place = _token(identity, session, endpoint, kind)
+    place = place_token(identity, session, endpoint, kind)
     return "/".join((place, name.replace("/", "%"), of_type.dds_name, _hash(identity, of_type), qos_text(qos)))
 
 
@@ -341,11 +347,6 @@ def qos_text(qos: Qos) -> str:
 def gid(token: str) -> bytes:
     """Return the identity of the endpoint with a token, 16 bytes; all nodes compute the same."""
     return xxhash.xxh3_128_digest(token.encode())[::-1]
-
-
-def _token(identity: NodeIdentity, session: str, number: int, kind: str) -> str:
-    namespace = identity.namespace.replace("/", "%")
-    return f"@ros2_lv/{identity.domain}/{session}/0/{number}/{kind}/%/{namespace}/{identity.name}"
 
 
 def _hash(identity: NodeIdentity, of_type: MessageType) -> str:

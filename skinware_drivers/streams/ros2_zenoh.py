@@ -27,7 +27,8 @@ if find_spec("zenoh") is None or find_spec("xxhash") is None:
 
 from skinware.bridge.endpoints import DEFAULT_ROUTER
 from skinware.bridge.link import ZenohLink
-from skinware.ros2.rmw_zenoh import gid, graph_endpoints, read_attachment
+from skinware.ros2 import rmw_zenoh
+from skinware.ros2.transport import NodeIdentity, Qos
 
 _TOKEN_PARTS, _MOST_TOKENS = 13, 8192
 _AT_ONCE = 64
@@ -81,11 +82,11 @@ class ZenohPort(TopicPort):
         self._event = -1
         self._waking = threading.Lock()  # zenoh's threads may still wake what is being closed
         try:
-            self._link = ZenohLink(graph_endpoints(options.router))
+            self._link = ZenohLink(rmw_zenoh.graph_endpoints(options.router))
         except BridgeError as error:
             raise BusNotAvailable(f"{name}: {error}") from None
         self._event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._link.watch_tokens(f"@ros2_lv/{domain}/*/*/*/MP/**", self._token)
+        self._link.watch_tokens(f"@ros2_lv/{domain}/*/*/*/{rmw_zenoh.PUBLISHER}/**", self._token)
         self.change(topics)
 
     def fileno(self) -> int:
@@ -104,13 +105,13 @@ class ZenohPort(TopicPort):
         while self._tokens:
             token, is_there = self._tokens.popleft()
             parts = token.split("/")
-            if len(parts) != _TOKEN_PARTS or parts[5] != "MP":  # of something else
+            if len(parts) != _TOKEN_PARTS or parts[5] != rmw_zenoh.PUBLISHER:  # of something else
                 continue
             if is_there:
-                if self.came(TopicSource(gid(token), f"rt{parts[9].replace('%', '/')}", parts[10], time_ns)):
+                if self.came(TopicSource(rmw_zenoh.gid(token), f"rt{parts[9].replace('%', '/')}", parts[10], time_ns)):
                     self._show("/".join(parts[9:12]))
             else:
-                self.went(gid(token))
+                self.went(rmw_zenoh.gid(token))
         return has_changed
 
     def read(self, size: int) -> bytes:  # noqa: ARG002
@@ -126,7 +127,7 @@ class ZenohPort(TopicPort):
             _, *topic, type_name, _ = key.split("/")
             number = numbers.get((name := "/".join(["rt", *topic]), type_name))
             try:
-                sequence, sent_ns, publisher = read_attachment(attached)
+                sequence, sent_ns, publisher = rmw_zenoh.read_attachment(attached)
             except ValueError:
                 number = None
             if number is None or len(sample) > LONGEST:
@@ -154,11 +155,12 @@ class ZenohPort(TopicPort):
     def _show(self, topic: str) -> None:
         """Show a subscription in the graph: many publishers send nothing while it shows none."""
         if topic not in self._shown:
-            place, node = f"@ros2_lv/{self._domain}/{self._link.zid}/0", f"%/%/_skin_driver_{os.getpid()}"
+            node = NodeIdentity(f"_skin_driver_{os.getpid()}", domain=self._domain)
             if not self._shown:
-                self._link.declare_token(f"{place}/0/NN/{node}")
+                self._link.declare_token(rmw_zenoh.node_token(node, self._link.zid))
             self._shown.add(topic)
-            self._link.declare_token(f"{place}/{len(self._shown)}/MS/{node}/{topic}/2::,{self._depth}:,:,:,,")
+            place = rmw_zenoh.place_token(node, self._link.zid, len(self._shown), rmw_zenoh.SUBSCRIPTION)
+            self._link.declare_token(f"{place}/{topic}/{rmw_zenoh.qos_text(Qos(self._depth, reliable=False))}")
 
     def _sample(self, key: str, attachment: bytes, payload: bytes) -> None:
         """Keep a sample; called in threads of zenoh."""

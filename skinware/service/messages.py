@@ -55,7 +55,7 @@ class Answer(msgspec.Struct):
 
 
 _ARGUMENTS = msgspec.json.Decoder(dict[str, Any], float_hook=float)
-"""Takes at most 30 ns a byte. msgspec's own way with numbers near the limits of a float takes ten times as long."""
+"""Takes at most 30 ns a byte. msgspec before 0.23 takes ten times as long for numbers near the limits of a float."""
 
 
 def decode_arguments(text: msgspec.Raw) -> dict[str, Any] | None:

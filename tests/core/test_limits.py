@@ -30,7 +30,7 @@ def test_reads_json_of_a_type() -> None:
         (b'{"event": "missed", "count": "x"}', "Expected `int`"),
         (b'{"event": "missed", "count": 1e400}', "out of range"),
         (b'{"event": "missed", "count": NaN}', "malformed"),
-        (b'{"event": "\xff"}', "utf-8"),
+        (b'{"event": "\xff"}', "(?i)utf-8"),
         (b"", "truncated"),
     ],
 )

@@ -318,7 +318,7 @@ def key(identity: NodeIdentity, name: str, of_type: MessageType) -> str:
 
 
 def place_token(identity: NodeIdentity, session: str, number: int, kind: str) -> str:
-    """Return the begin of a token: the node, the session, and the kind and number of an endpoint; 0, NN: the node."""
+    """Return how a token begins: session, number and kind of an endpoint (0 and NN: the node itself), and its node."""
     namespace = identity.namespace.replace("/", "%")
     return f"@ros2_lv/{identity.domain}/{session}/0/{number}/{kind}/%/{namespace}/{identity.name}"
 

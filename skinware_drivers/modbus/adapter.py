@@ -200,10 +200,11 @@ class ModbusAdapter(Adapter[OptionsT]):
 
     async def find_unit(self, link: Link, units: Sequence[int], address: int) -> int:
         """Return the first of these units that answers a question for a register, or refuses it; else the last one."""
-        for unit in np.repeat(units[:-1], 2).tolist():  # an answer that is lost must not lead to another device
-            with contextlib.suppress(HandshakeTimeout):
-                await self.read_or_none(link, address, unit=unit)
-                return int(unit)
+        for unit in units[:-1]:
+            for _ in range(2):  # an answer that is lost must not lead to another device
+                with contextlib.suppress(HandshakeTimeout):
+                    await self.read_or_none(link, address, unit=unit)
+                    return unit
         return units[-1]
 
     async def write(self, link: Link, address: int, values: Sequence[int], *, unit: int = 1) -> None:

@@ -15,7 +15,7 @@ from playwright.sync_api import Page
 
 from skinware_drivers.testing.waiting import wait_until
 from tests.browser import chromium
-from tests.browser.browsing import Troubles, look, until
+from tests.browser.browsing import PHONE, Troubles, look, tell, until
 
 
 def document(text: str) -> str:
@@ -32,6 +32,14 @@ def test_webgl_draws_what_is_looked_at(open_page: Callable[..., Page]) -> None:
     )
     assert np.allclose(look(page, 10, 10, 90, 90), 150, atol=2)  # green, in grey
     assert look(page, 150, 150, 200, 200).mean() == 255
+    assert look(page).shape == (700, 1100)
+
+
+def test_windows_have_their_own_size_and_state(open_page: Callable[..., Page]) -> None:
+    large, small = (open_page(document(""), *size) for size in ((), (PHONE,)))
+    assert [tell(page, "innerWidth") for page in (large, small)] == [1100, 390]
+    tell(large, "window.mark = a[0]", 7)
+    assert [tell(page, "window.mark ?? null") for page in (large, small)] == [7, None]
 
 
 def test_what_never_comes_true_is_told(open_page: Callable[..., Page]) -> None:

@@ -170,6 +170,16 @@ def test_marks_of_taxels(
     assert tell("marks.js", FILL, dimmed, is_old, is_wipe) == [True, False, marks]
 
 
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_each_level_is_farther_from_the_ground_in_grey(tell: Callable[..., Any], theme: str) -> None:
+    """Told apart by brightness alone, by whoever sees few colours."""
+    colours = tell("palette.js", "[...m.ramp(a[0])]", theme)
+    luma = [0.2126 * colours[4 * i] + 0.7152 * colours[4 * i + 1] + 0.0722 * colours[4 * i + 2] for i in range(251)]
+    rising = luma if theme == "dark" else luma[::-1]
+    assert all(later >= earlier - 0.5 for earlier, later in pairwise(rising))
+    assert all(later - earlier > 5 for earlier, later in pairwise(rising[::25]))
+
+
 PAST = """(() => {
     const past = new m.Past(a[0]);
     const sheet = { status: new Uint8Array(1000), shear: null, scale: [0, 1], mode: 'raw' };

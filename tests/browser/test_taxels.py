@@ -113,6 +113,22 @@ def test_a_press_moves_over_the_right_taxels(sleeve: Sleeve, address: str, open_
 
 
 @pytest.mark.parametrize("theme", THEMES)
+def test_more_is_farther_from_the_ground(sleeve: Sleeve, address: str, open_page: OpenPage, theme: str) -> None:
+    """In grey, as who sees no colours has it."""
+    page = open_page(f"{address}#{RAW_SCALE}&theme={theme}")
+    assert sleeve.values is not None
+    raw = np.linspace(255, 0, len(sleeve.taxels)).round()
+    sleeve.values[sleeve.taxels] = raw
+    seen(page, int(sleeve.taxels[-1]), "s.level === 250")
+    screen = look(page)
+    ground = np.median(screen[:, screen.shape[1] // 2])
+    distance = abs(brightness(screen, places(page, sleeve.taxels)) - ground)
+    steps = [distance[raw == value].mean() for value in np.unique(raw)[::-8]]
+    assert (np.diff(steps) > 0).all(), steps
+    assert steps[0] > 8  # the least is seen too
+
+
+@pytest.mark.parametrize("theme", THEMES)
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_dead_taxel_is_found_by_its_mark(
     sleeve: Sleeve, address: str, open_page: OpenPage, theme: str, view: str

@@ -20,6 +20,7 @@ void skinware_baseline_begin(struct baseline *b) {
     for (i = 0; i < b->n; i++) {
         b->level[i] = b->noise2[i] = b->last[i] = b->noted[i] = b->first[i] = NAN;
         b->gain[i] = b->gain_before[i] = 1;
+        b->patches[b->patch[i]].taxels += 1;
         b->gain_variance[i] = GAIN_SPREAD2;
         b->noise_s[i] = NOISE_S;
         b->since_fall_s[i] = b->since_end_s[i] = INFINITY;

@@ -43,7 +43,7 @@
 #define LEAST_GAIN 0.1f       /* with less, something else moves the taxel */
 #define MOST_GAIN 3.0f        /* with more, too */
 #define QUIET 0.15f           /* share of the typical variance of noise of a patch: with less, a taxel is dead */
-#define FEW_TAXELS 3.0        /* free taxels of a patch of which nothing is common */
+#define FEW_TAXELS 3.0        /* taxels, free ones, of a patch of which nothing is common */
 #define MANY_TAXELS 20.0      /* free taxels of a patch that no touch covers evenly but for a hand that slams on all of it */
 #define NEARLY_ALL 0.85       /* share of them that has to move alike where the mode jumps */
 #define GAP_S 2.0             /* seconds without data in which a device may have restarted: a jump after them may be a rise */
@@ -84,6 +84,7 @@ struct run { /* neighbouring taxels of one patch */
 };
 
 struct patch {
+    double taxels;    /* their number */
     double variance;  /* of the common mode */
     double agility;   /* variance that the mode gains in a second */
     double rate;      /* average speed, a second */

@@ -169,7 +169,7 @@ void follow_common(struct baseline *b, double passed_s) {
         return;
     for (number = 0; number < b->n_patches; number++) {
         struct patch *p = &b->patches[number];
-        p->variance += p->agility * passed_s;
+        p->variance = p->taxels > FEW_TAXELS ? p->variance + p->agility * passed_s : 0;
         for (i = 0; i < 4; i++)
             p->sums[i] = 0;
     }

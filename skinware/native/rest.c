@@ -98,10 +98,11 @@ static int add(struct baseline *b, int64_t time_ns) {
         b->patches[i].move = b->patches[i].common;
     medians(b, b->patch, b->n_patches, difference, b->flag, &b->patches->common,
             sizeof(struct patch) / sizeof(double));
-    for (i = 0; i < b->n_patches && b->block_frames > 0; i++) {
+    for (i = 0; i < b->n_patches; i++) {
         struct patch *p = &b->patches[i];
-        const float moved = (float)p->common - (float)p->move;
-        p->moves2 += ((double)(moved * moved) - p->moves2) / 20;
+        const float common = p->taxels > FEW_TAXELS ? (float)p->common : 0.0f, moved = common - (float)p->move;
+        p->common = (double)common;
+        p->moves2 += b->block_frames > 0 ? ((double)(moved * moved) - p->moves2) / 20 : 0;
     }
     for (i = 0; i < n; i++) {
         const float d = difference[i], c = b->flag[i] ? (float)b->patches[b->patch[i]].common : 0.0f;

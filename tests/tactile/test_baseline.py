@@ -326,6 +326,23 @@ def test_what_was_covered_at_the_start_is_good_a_second_after() -> None:
     assert bench.run(0.2, on(4)).touched[4]
 
 
+@pytest.mark.parametrize("together", [1, 3])
+@pytest.mark.parametrize("signed", [False, True])
+def test_few_taxels_have_no_common_mode_and_feel_after_minutes_and_after_a_press_at_the_start(
+    together: int, signed: bool
+) -> None:
+    """Such are sums of forces, and fingertips with one value: their press at the start is no drift that they share."""
+    baseline = Baseline(np.zeros(together, int), np.zeros(together, int), signed=signed)
+    random, time_s = np.random.default_rng(together), np.arange(0, 400, 0.1)
+    load = np.interp(time_s, [3.4, 3.5, 4.7, 4.8, 60, 60.1, 70, 70.1, 390, 390.1], [0, 30, 30, 0] * 2 + [0, 30])
+    for moment_s, force in zip(time_s, load, strict=True):
+        values = np.round(15 + force + 0.4 * random.standard_normal(together))
+        calm = baseline.update(round(moment_s * NS_PER_S), values)
+        if moment_s > 10 and force == load[np.abs(time_s - moment_s) < 0.5].mean():
+            assert (calm.touched == (force > 0)).all(), moment_s
+    assert calm.value == pytest.approx(30, abs=2)
+
+
 def test_types_that_a_touch_moves_to_both_sides() -> None:
     bench = Bench(signed=True)
     bench.run(6)

@@ -182,6 +182,15 @@ def test_patches_that_step_as_a_whole_and_gaps(seed: int) -> None:
     both.compare_states()
 
 
+def test_patches_of_few_taxels() -> None:
+    patch, random = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3]), np.random.default_rng(1)
+    both = Both(patch, patch)
+    for number in range(900):
+        load = 40 * (number % 150 > 90) + number / 100
+        both.update((number + 1) * 50_000_000, np.round(20 + load + 0.5 * random.standard_normal(10)))
+    both.compare_states()
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_taxels_of_few_levels(levels: int) -> None:
     both, random = Both(np.arange(N) // 12, np.arange(N) // 48), np.random.default_rng(levels)

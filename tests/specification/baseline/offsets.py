@@ -164,6 +164,7 @@ class Offsets:
         self.noise_s: Floats = np.full(n, NOISE_S, np.float32)
         self.patches = Grouping(patch)
         self.common = CommonMode(self.patches.n)
+        self._many = self.patches.sum(np.ones(n, bool)) > FEW_TAXELS
         self.agility, self.typical, self.wander, self._speed2 = np.zeros((4, self.patches.n))
         self._modules = Grouping(module)
         self.rate2 = np.zeros(self._modules.n)
@@ -203,7 +204,7 @@ class Offsets:
         if passed_s <= 0:
             return
         mode = self.common
-        mode.variance += mode.agility * passed_s
+        mode.variance = np.where(self._many, mode.variance + mode.agility * passed_s, 0)
         typical = self.patches.spread(self.typical)
         free = free & (self.noise2 >= np.float32(QUIET) * typical)
         own = np.maximum(self.noise2, typical) + self.variance

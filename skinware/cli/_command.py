@@ -266,6 +266,8 @@ def run(command: click.Command, *, goes_on: bool = False) -> NoReturn:
     Args:
         goes_on: its work goes on while its output is not read; by default it waits for the reader, as ``| less`` needs.
     """
+    if f"_{command.name}_COMPLETE".upper().replace("-", "_") in os.environ:
+        command.main(prog_name=command.name)  # the shell asks for completions
     for number in ending_signals()[1:]:
         signal.signal(number, signal.default_int_handler)
     sys.unraisablehook = _interrupt_again
@@ -294,8 +296,6 @@ def exit_status(command: click.Command, arguments: Sequence[str]) -> int:
     command in silence. ``NO_COLOR`` in the environment removes the colours.
     """
     name = command.name or os.path.basename(sys.argv[0])
-    if f"_{name}_COMPLETE".upper().replace("-", "_") in os.environ:
-        command.main(list(arguments), prog_name=name)  # the shell asks for completions
     if logging.lastResort is not None:  # for commands that do not log_to_stderr
         logging.lastResort.setFormatter(Formatter(f"{name}: %(message)s"))
     try:

@@ -94,16 +94,17 @@ def command(context: click.Context) -> None:
         echo(context.get_help())
 
 
-@command.command("completion")
+@command.command(
+    "completion",
+    epilog=cli.examples(
+        "skin completion bash >~/.skin.bash    and in ~/.bashrc: source ~/.skin.bash",
+        "skin completion zsh >~/.skin.zsh      and in ~/.zshrc: source ~/.skin.zsh",
+        "skin completion fish >~/.config/fish/conf.d/skin.fish",
+    ),
+)
 @click.argument("shell", type=click.Choice(_SHELLS))
 def completion(shell: str) -> None:
-    r"""Print completion of all commands for a SHELL.
-
-    \b
-    bash: skin completion bash >~/.skin.bash, and in ~/.bashrc: source ~/.skin.bash
-    zsh:  skin completion zsh >~/.skin.zsh, and in ~/.zshrc: source ~/.skin.zsh
-    fish: skin completion fish >~/.config/fish/conf.d/skin.fish
-    """
+    """Print completion of all commands for a SHELL."""
     from click.shell_completion import get_completion_class
 
     make: Callable[..., Any] | None = get_completion_class(shell)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import socket
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -15,6 +16,8 @@ import click
 from skinware.cli import _command as cli
 from skinware.cli._terminal import echo, print_json
 from skinware.errors import BusNotAvailable, ConfigurationError, SkinwareError
+from skinware.text import nearest_name
+from skinware_drivers.bus_names import BusName
 
 if TYPE_CHECKING:
     from skinware_drivers.adapter import AnyAdapter
@@ -91,8 +94,10 @@ def command(
             )
         outcome = _through_driver(owner, of_bus, operation, given, timeout_s, yes)
     else:
+        names = [driver.name for driver in drivers if driver.namespace == place.name]
+        no_driver = f"no driver {target!r} runs in namespace {place.name!r}{nearest_name(target, names)}"
         driver_type, adapter = _adapter(target, driver_name, options, config)
-        outcome = _without_driver(target, place.name, driver_type, adapter, operation, given, yes, force)
+        outcome = _without_driver(target, no_driver, driver_type, adapter, operation, given, yes, force)
     if as_json:
         print_json({"target": target, "driver": owner, "operation": operation, **outcome})
     else:
@@ -108,7 +113,6 @@ def _through_driver(
     yes: bool,
 ) -> dict[str, Any]:
     from skinware import DriverReader
-    from skinware.text import nearest_name
     from skinware_drivers.operations import operations_of
     from skinware_drivers.registry import load_driver
 
@@ -137,7 +141,7 @@ def _through_driver(
 
 def _without_driver(
     bus_name: str,
-    namespace: str,
+    no_driver: str,
     driver_type: str,
     adapter: AnyAdapter,
     operation: str | None,
@@ -154,6 +158,9 @@ def _without_driver(
     if operation is None:
         if bus_name in declared:
             raise click.UsageError(f"{bus_name} is an operation: name the driver or the bus before it")
+        named, interfaces = BusName.of(bus_name), [name for _, name in socket.if_nameindex()]
+        if named.interface == "socketcan" and named.channel not in interfaces:
+            raise BusNotAvailable(f"{no_driver}; no bus has this name either")
         return {"operations": {name: _description(one.method) for name, one in declared.items()}}
 
     def agree(patches: Sequence[Patch]) -> None:
@@ -169,7 +176,7 @@ def _without_driver(
     except BusNotAvailable as error:
         if ":" in bus_name:
             raise
-        raise BusNotAvailable(f"no driver {bus_name!r} runs in namespace {namespace!r}; as a bus: {error}") from None
+        raise BusNotAvailable(f"{no_driver}; as a bus: {error}") from None
     return {"results": {bus_name: result}}
 
 

@@ -88,11 +88,6 @@ def test_times_are_understood(text: str, number: float, capsys: pytest.CaptureFi
     assert capsys.readouterr().out == f"timeout {number}\n"
 
 
-def test_unknown_options_are_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status(command_that(), ["--nonsense"]) == 2
-    assert "No such option" in capsys.readouterr().err
-
-
 def test_examples_keep_their_lines(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_status(command_that(), ["--help"]) == 0
     assert "    skin-try      one\n    skin-try -x   two\n" in capsys.readouterr().out

@@ -142,7 +142,6 @@ def test_a_driver_that_starts_while_a_person_thinks_is_noticed(
 @pytest.mark.parametrize(
     ("arguments", "status", "words"),
     [
-        ([], 2, "NAME_OR_BUS"),
         ([VIRTUAL, "nonsense"], 2, "no operation 'nonsense'"),
         (["rebaseline"], 2, "rebaseline is an operation: name the driver or the bus before it"),
         ([VIRTUAL, "rate", "50"], 2, "KEY=VALUE"),
@@ -153,6 +152,7 @@ def test_a_driver_that_starts_while_a_person_thinks_is_noticed(
         ([VIRTUAL, "versions", "--option", "board=7"], 2, "did you mean 'boards'"),
         (["virtual?boards=7&streaming=yes", "rebaseline", "--yes"], 2, "another program may be using the bus"),
         (["torso", "versions"], 1, "no driver 'torso' runs in namespace"),
+        (["torso", "--driver", "xela"], 1, "no bus has this name either"),
         ([VIRTUAL, "versions", "--config", "/no/such.toml"], 2, "/no/such.toml"),
     ],
 )
@@ -162,6 +162,12 @@ def test_mistakes_get_one_clear_line_and_the_right_exit_code(
     text = configured(capsys, *arguments, status=status)
     assert words in text
     assert "Traceback" not in text
+
+
+def test_the_nearest_driver_is_proposed_before_any_operation_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    with driving(emulated(boards=(7,))):
+        assert "did you mean 'roboskin'" in configured(capsys, "robskin", status=1)
+        assert "did you mean 'roboskin'" in configured(capsys, "robskin", "versions", status=1)
 
 
 def test_running_drivers_are_those_that_live(namespace: Namespace) -> None:

@@ -232,14 +232,16 @@ class Peer:
 
     def _token(self, key: str, there: bool) -> None:
         robot, version, instance = token_parts(key)
-        bridges = self.bridges
-        if robot != self.keys.robot:
-            if not there or len(bridges.other_robots) < _MOST_BRIDGES:
-                (bridges.other_robots.add if there else bridges.other_robots.discard)(robot)
-            return
-        if there and len(bridges.there) >= _MOST_BRIDGES:
+        bridges, is_ours = self.bridges, robot == self.keys.robot
+        known, name = (bridges.there, instance) if is_ours else (bridges.other_robots, robot)
+        if not there:
+            known.discard(name)
+        elif len(known) < _MOST_BRIDGES:
+            known.add(name)
+        elif is_ours:
             raise BridgeError(f"more than {_MOST_BRIDGES} bridges serve robot {robot}")
-        (bridges.there.add if there else bridges.there.discard)(instance)
+        if not is_ours:
+            return
         if there and version != VERSION:
             self.report_once(
                 "version",

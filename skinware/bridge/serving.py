@@ -140,13 +140,14 @@ class Server:
     def run(self, each_second: Callable[[], object] = lambda: None) -> None:
         """Run until ``stop``; call ``each_second`` once a second."""
 
-        def second() -> None:
+        def once_a_second() -> None:
             for served in self._services.values():
                 served.stream.expire()
-            self._code_soon(self._second)
+            self._code_soon(self._summaries.send, self._there(), self.missed)
+            self._code_soon(self._expire_parts)
             each_second()
 
-        self._collector.run(second)
+        self._collector.run(once_a_second)
 
     def stop(self) -> None:
         """End it; from any thread, and from a signal handler."""
@@ -211,9 +212,8 @@ class Server:
         if not self._coding.submit(self.guard.run, "a question", work, *arguments):
             self.guard.refuse("a question", f"{_MOST_FRAMES} others wait")
 
-    def _second(self) -> None:
-        """Send the summary, end parts for which no question came lately, and answer those that waited too long."""
-        self._summaries.send(self._there(), self.missed)
+    def _expire_parts(self) -> None:
+        """End parts for which no question came lately, and answer those that waited too long."""
         for number, part in list(self._parts.items()):
             if now_ns() - part.asked_ns > _KEPT_NS:
                 self._parts.pop(number).close()

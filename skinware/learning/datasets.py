@@ -65,7 +65,9 @@ class RecordedWindows(Sequence[Item]):
         for path in paths:
             with skinware.recording.open(path) as recording:
                 for part in _track(recording, type_name, driver).parts:
-                    known = _same(known, part.structure, path)
+                    if known not in (None, part.structure):
+                        raise ConfigurationError(f"{path}: other sensors than before; make a dataset of each structure")
+                    known = part.structure
                     self._add(part.read(type_name=type_name), type_name)
         if known is None:
             raise ConfigurationError("a dataset of no recording: give at least one")
@@ -217,9 +219,3 @@ def _track(recording: skinware.recording.Recording, type_name: str, driver: str 
         found = f"drivers with {type_name}: {', '.join(with_type)}" if with_type else f"no driver with {type_name}"
         raise ConfigurationError(f"{recording.path}: {found}; give driver=, one of: {', '.join(recording.drivers)}")
     return recording[with_type[0]]
-
-
-def _same(known: Structure | None, structure: Structure, path: str | Path) -> Structure:
-    if known is not None and structure != known:
-        raise ConfigurationError(f"{path}: other sensors than before; make a dataset of each structure")
-    return structure

@@ -241,8 +241,8 @@ def values_of(
 def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[list[DriverSnapshot]], Values]:
     """Return a function of k snapshots: (k, m) sums of the values of each line's sensors; the highest of pressures."""
     of_lines = [_sensors_of(driver, line) for line in lines]
-    has_sensors = np.array([len(sensors) > 0 for sensors in of_lines], bool)
     some = [sensors for sensors in of_lines if len(sensors)]
+    has_sensors = np.array([len(sensors) > 0 for sensors in of_lines], bool)
     at = np.concatenate([np.zeros(0, np.int64), *some])
     scale, offset = _units_of(driver.structure, at)
     starts = np.cumsum([0, *map(len, some)])[:-1]
@@ -255,13 +255,12 @@ def _totals(driver: ShownDriver, lines: list[Line]) -> Callable[[list[DriverSnap
         values[np.array([frame.status[at] for frame in frames]) & _NO_VALUE != 0] = np.nan
         if is_each:
             return values
-        found = np.full((len(frames), len(lines)), np.nan)
         unknown = np.isnan(values)
         values[unknown] = 0
-        sums, most = (add.reduceat(values, starts, axis=1) for add in (np.add, np.maximum))
-        of_lines = np.where(highest, most, sums)
-        of_lines[np.logical_and.reduceat(unknown, starts, axis=1)] = np.nan
-        found[:, has_sensors] = of_lines
+        sums, most = np.add.reduceat(values, starts, axis=1), np.maximum.reduceat(values, starts, axis=1)
+        is_empty = np.logical_and.reduceat(unknown, starts, axis=1)
+        found = np.full((len(frames), len(lines)), np.nan)
+        found[:, has_sensors] = np.where(is_empty, np.nan, np.where(highest, most, sums))
         return found
 
     return totals

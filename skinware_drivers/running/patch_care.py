@@ -134,15 +134,15 @@ class PatchCare:
         if now_ns() - begun_ns < 2 * generation.publisher.pace.silence_ns:
             return  # unheard boards may send: to set them up again would move their baseline
         not_heard = generation.patches_in(line, PatchState.STALE, PatchState.EXPECTED, PatchState.RESTARTED)
-        silent, asked_ns = self._surely_silent(not_heard), now_ns()
+        silent, asked_ns, live = self._surely_silent(not_heard), now_ns(), self._patches_in(PatchState.LIVE)
         if self._knows_only_all:
-            is_due = self._set_ups_of_all.is_due or not self._patches_in(PatchState.LIVE)
+            is_due = self._set_ups_of_all.is_due or not live
             if not silent:
                 self._set_ups_of_all.begin_again()
-            elif is_due and self._patches_in(PatchState.LIVE):  # which it disturbs: less and less often
+            elif is_due and live:  # which it disturbs: less and less often
                 self._set_ups_of_all.begin()
             silent = silent[:1] if is_due else []  # the others are set up with it
-        for patch in self._patches_in(PatchState.LIVE):
+        for patch in live:
             self._set_ups.pop(patch.key, None)
         for patch in silent:
             if await self._is_to_be_set_up(patch) and self._surely_silent([patch]):

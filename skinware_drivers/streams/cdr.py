@@ -75,12 +75,8 @@ class CdrMessage:
     def number(self, name: str, within: Indices = ()) -> int:
         """Return a whole number on which the places of others depend."""
         found = self.numbers[name][within]
-        self.fix(found)
-        return int(found.of(self.sample)[0])
-
-    def fix(self, found: Numbers) -> None:
-        """Note that the places of other fields depend on these bytes."""
         self._fixed.append((found.start, found.start + found.length * np.dtype(found.dtype).itemsize))
+        return int(found.of(self.sample)[0])
 
     @property
     def fixed(self) -> npt.NDArray[np.int64]:

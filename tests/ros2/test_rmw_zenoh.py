@@ -21,7 +21,7 @@ import pytest
 from skinware.errors import BridgeError, ConfigurationError
 from skinware.memory.namespace import Namespace
 from skinware.ros2.rmw_zenoh import ZenohNode
-from skinware.ros2.transport import Distro, MessageType, Node, NodeIdentity, Qos, ServiceType
+from skinware.ros2.transport import Distro, MessageType, NodeIdentity, Qos, ServiceType
 from skinware_drivers.testing.waiting import PATIENCE_S, wait_until
 from tests.ros2.graph_peer import GID, Found, GraphPeer, Heard, Message, peer
 from tests.ros2.router import Router, router, sockets
@@ -395,8 +395,3 @@ def test_publishers_and_services_that_come_and_go_leave_nothing(graph: Graph) ->
     publishing(publisher, other.hear(other.wait_for("MP", "/skin/arm/last")))
     wait_until(lambda: list(other.found("MP")) == ["/skin/arm/last"] and not other.found("SS"))
     assert skin._endpoints == {publisher}
-
-
-def is_a_node(one: ZenohNode) -> Node:
-    """For the type checker: it is what the bridge wants."""
-    return one

@@ -99,7 +99,7 @@ namespace_option = click.option(
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for programs.")
 group_option = click.option("--group", metavar="GROUP", help="Group whose members may read the namespace.")
-driver_option = click.option("--driver", metavar="DRIVER", help="Driver to read, if several run.")
+driver_argument = click.argument("driver", metavar="[DRIVER]", required=False)
 verbose_option = click.option("-v", "--verbose", is_flag=True, help="Log more to stderr.")
 names_argument = click.argument("names", metavar="[NAME]...", nargs=-1)
 caller_option = click.option(
@@ -140,9 +140,9 @@ def type_option(what: str) -> Callable[[_Decorated], _Decorated]:
     return click.option("--type", "type_name", metavar="TYPE", help=what)
 
 
-def duration_option(what: str = "End after SECONDS.") -> Callable[[_Decorated], _Decorated]:
+def duration_option(what: str = "End after SECONDS.", default: str | None = None) -> Callable[[_Decorated], _Decorated]:
     """``-T SECONDS``: the command ends by itself after this time."""
-    return click.option("-T", "duration_s", metavar="SECONDS", type=seconds, help=what)
+    return click.option("-T", "duration_s", metavar="SECONDS", type=seconds, default=default, help=what)
 
 
 def output_option(

@@ -257,7 +257,7 @@ def opened(
 ) -> Iterator[tuple[Gathering, Any]]:
     with ExitStack() as stack:
         namespace = Namespace(how.namespace)
-        reader = stack.enter_context(reader_of(namespace, how.driver, "--driver"))
+        reader = stack.enter_context(reader_of(namespace, how.driver, "DRIVER"))
         source = LoadSource(reader.structure, reader.driver_type, how.type_name)
         pose_source = None
         if poses is not None:

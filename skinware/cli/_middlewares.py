@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
     "interfaces",
     multiple=True,
     metavar="NAME",
-    help="A network to use, with --rmw dds: eth0, or an address of this machine; repeatable.  [default:"
+    help="A network to use, with --rmw dds: eth0, or an address of this machine; may be repeated.  [default:"
     " $CYCLONEDDS_URI, else this machine alone]",
 )
 @click.option(
@@ -156,7 +156,7 @@ def ros2(
     epilog=cli.examples(
         "skin-bridge yarp torso --yarp 4               then, with YARP: yarp read ... /skinware/torso",
         "skin-bridge yarp --yarp 3 --namespace calm --prefix /icub/skin --regions skin/left_arm.regions.toml",
-        "skin-bridge yarp --yarp 4 --server 10.0.0.1:10000 --listen 10.0.0.7   for a robot's network",
+        "skin-bridge yarp --yarp 4 --server 10.0.0.1:10000 --host 10.0.0.7   for a robot's network",
     ),
 )
 @cli.names_argument
@@ -178,7 +178,7 @@ def ros2(
     type=click.Choice(["3", "4"]),
     help="Major version of the YARP of binary readers; without it, only text readers are served.",
 )
-@click.option("--listen", "host", default="127.0.0.1", metavar="HOST", help="Address at which ports listen.")
+@click.option("--host", default="127.0.0.1", metavar="HOST", help="Address to listen at.")
 @cli.namespace_option
 @cli.json_option
 def yarp(

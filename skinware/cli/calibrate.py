@@ -34,11 +34,12 @@ _offset = click.option(
     help="Distance from sensors outwards to points: radius of the probe, and the cover. Needs --layout with normals.",
 )
 _gathering = cli.options(
-    cli.driver_option,
+    cli.driver_argument,
     cli.type_option("Sensors.  [default: pressure, or the first type]"),
     click.option(
         "--share",
         type=click.FloatRange(0, 1),
+        metavar="X",
         default=0.95,
         help="Stop when this part of the sensors has enough.",
     ),
@@ -50,7 +51,7 @@ _gathering = cli.options(
 )
 _pressing = cli.options(
     click.option("--poses", "service", metavar="SERVICE", required=True, help="Service that publishes poses."),
-    click.option("--touches", type=click.IntRange(1), default=5, help="Wanted on each sensor."),
+    click.option("--touches", type=click.IntRange(1), metavar="N", default=5, help="Wanted on each sensor."),
     click.option("--frame", metavar="NAME", help="Coordinate frame of the poses.  [default: name of the service]"),
 )
 
@@ -67,17 +68,17 @@ def command() -> None:
 @command.command(
     epilog=cli.examples(
         "skin-calibrate topology -o map.toml                    stroke the skin for some minutes",
-        "skin-calibrate topology --namespace calm -o map.toml    with the driver of skin-calm",
+        "skin-calibrate topology torso --namespace calm -o map.toml    a driver that skin-calm calms",
     )
 )
 @_output
 @_pitch
 @_gathering
 def topology(file: Path, pitch_m: float, **options: Any) -> None:
-    """Find which sensors lie side by side, from strokes with a finger, and draw a map of each piece of skin.
+    """Find which sensors of DRIVER, or of the only one that runs, lie side by side, from strokes with a finger.
 
-    Only a finger is needed. Curved pieces are unrolled. It ends when 95 % of the sensors have felt the finger in 20
-    samples; longer strokes give better maps.
+    It draws a map of each piece of skin; curved pieces are unrolled. It ends when 95 % of the sensors have felt the
+    finger in 20 samples; longer strokes give better maps.
     """
     import numpy as np
 
@@ -178,8 +179,9 @@ def touch(
     "tip_m",
     type=float,
     nargs=3,
+    metavar="X Y Z",
     default=(0, 0, 0),
-    help="Estimate of the tip in the frame of its carrier.",
+    help="Estimate of the tip in the frame of its carrier, metres.",
 )
 @_offset
 @_pitch
@@ -274,8 +276,8 @@ def check(context: click.Context, /, file: Path, pitch_m: float, **options: Any)
 @click.option("--reference", metavar="SERVICE", help="Service of a load cell or force-torque sensor.")
 @click.option("--column", metavar="NAME", default="force_n", help="With 1 or 3 forces, N.")
 @click.option("--axes", type=click.Choice(["1", "3"]), default="1", help="Forces in the column.")
-@click.option("--newtons", type=click.FloatRange(0), multiple=True, metavar="N", help="A known weight, N; repeat it.")
-@click.option("--weight-s", type=click.FloatRange(0.5), default=8.0, help="How long each rests.")
+@click.option("--newtons", type=click.FloatRange(0), multiple=True, metavar="N", help="A weight; may be repeated.")
+@click.option("--weight-s", type=click.FloatRange(0.5), metavar="SECONDS", default=8.0, help="How long each rests.")
 @_gathering
 def force(
     file: Path,

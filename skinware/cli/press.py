@@ -24,13 +24,13 @@ _ASK_S = 1.0
     "skin-driver --bus virtual                       an emulated forearm and hand, in another terminal",
     "skin-press 0.07 0.0225 0                        for one second",
     "skin-press 0.19 0 -0.0125 --seconds 60          its palm, for a minute",
-    "skin-press 0.07 0 0.02 --force 6 --radius 0.01  hard, with a thumb",
+    "skin-press 0.07 0 0.02 --newtons 6 --radius 0.01  hard, with a thumb",
     context_settings={"ignore_unknown_options": True},
 )
 @click.argument("x", type=float)
 @click.argument("y", type=float)
 @click.argument("z", type=float)
-@click.option("--force", "force_n", type=float, metavar="N", default=3.0, help="Newtons.")
+@click.option("--newtons", "force_n", type=float, metavar="N", default=3.0, help="Force of the press.")
 @click.option(
     "--radius",
     "radius_m",
@@ -100,7 +100,3 @@ def _the_only_one(namespace: Namespace) -> str:
 
 
 main = partial(cli.run, command)
-
-
-if __name__ == "__main__":
-    main()

@@ -59,12 +59,12 @@ def list_(files: tuple[Path, ...], namespace: str | None, as_json: bool) -> None
 @command.command(
     epilog=cli.examples(
         "skin-regions paint palm               stroke the palm, then press Enter",
-        "skin-regions paint palm --namespace calm --driver left_hand",
+        "skin-regions paint palm left_hand --namespace calm",
         "skin-regions paint palm -T 20 --json  for programs: paint for 20 s",
     ),
 )
 @click.argument("name")
-@cli.driver_option
+@cli.driver_argument
 @cli.type_option("Sensors to paint.  [default: normal force or pressure, else another touch]")
 @cli.output_option("Write the region into this file, new or not.", name="file", default=cli.DEFAULT_REGIONS)
 @click.option("-f", "--force", is_flag=True, help="Replace a region of this name.")
@@ -81,7 +81,7 @@ def paint(
     namespace: str | None,
     as_json: bool,
 ) -> None:
-    """Make a region of the sensors that you stroke.
+    """Make region NAME of the sensors of DRIVER, or of the only one that runs, that you stroke.
 
     Leave the skin alone for the first second. Holes are closed where the driver knows the places of its sensors.
     """
@@ -94,7 +94,7 @@ def paint(
         raise click.UsageError("without a terminal there is no Enter: give -T SECONDS")
     if file.exists() and not force and name in [region.name for region in read_regions(file)]:
         raise ConfigurationError(f"{file}: there is a region {name!r} already; --force replaces it")
-    with reader_of(Namespace(namespace), driver, "--driver") as reader:
+    with reader_of(Namespace(namespace), driver, "skin-regions paint NAME DRIVER") as reader:
         type_name = type_name or types_of(reader.structure)[0].name
         stroked, in_region = _paint(reader, type_name, as_json, duration_s)
         uid = reader.structure.sensor_uid[reader.structure.index(type_name)][in_region]

@@ -118,7 +118,7 @@ class DoctorProgram:
 
     def __init__(self, program: Sequence[str], namespace: str) -> None:
         self.findings: list[dict[str, Any]] = []
-        self._command = [*program, "--json", "--seconds", "2", "--namespace", namespace] if program else []
+        self._command = [*program, "--json", "-T", "2", "--namespace", namespace] if program else []
         self._running: asyncio.Task[None] | None = None
         self._seen: frozenset[object] = frozenset()
         self._begun_ns = -_AGAIN_NS

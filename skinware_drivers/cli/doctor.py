@@ -88,7 +88,7 @@ def _row(label: str, text: str, width: int | None, hang: int = _LABEL) -> list[s
     "skin-doctor --json | jq '.findings[] | {severity, what, where}'",
 )
 @click.argument("file", type=cli.FILE, required=False)
-@click.option("--seconds", "watch_s", type=cli.seconds, default="3", help="Look for SECONDS.")
+@cli.duration_option("Look for SECONDS.", default="3")
 @click.option(
     "--report",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -97,7 +97,7 @@ def _row(label: str, text: str, width: int | None, hang: int = _LABEL) -> list[s
 )
 @cli.namespace_option
 @cli.json_option
-def command(file: Path | None, watch_s: float, report: Path | None, namespace: str | None, as_json: bool) -> None:
+def command(file: Path | None, duration_s: float, report: Path | None, namespace: str | None, as_json: bool) -> None:
     """Find out what is wrong: look at interfaces, permissions, buses, patches, times, taxels, files and the machine.
 
     With FILE: look at a recording. Nothing is sent on any bus, and nothing is changed.
@@ -108,7 +108,7 @@ def command(file: Path | None, watch_s: float, report: Path | None, namespace: s
     from skinware_drivers.doctor.examining import examine
     from skinware_drivers.doctor.looking import look
 
-    evidence = look(Namespace(namespace), watch_s, _progress) if file is None else _recorded(file)
+    evidence = look(Namespace(namespace), duration_s, _progress) if file is None else _recorded(file)
     _progress(-1.0)
     found = examine(evidence)
     if report is not None:

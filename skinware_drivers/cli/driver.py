@@ -81,7 +81,7 @@ def _print_unit(context: click.Context, _parameter: click.Parameter, wanted: boo
     "buses",
     multiple=True,
     metavar="BUS",
-    help="Bus that the skin is attached to: can0, /dev/ttyUSB0, virtual ...; repeat it for several.",
+    help="Bus that the skin is attached to: can0, /dev/ttyUSB0, virtual ...; may be repeated.",
 )
 @click.option(
     "--driver",

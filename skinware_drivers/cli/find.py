@@ -33,7 +33,7 @@ _MOST_CLASSES = 6
     "skin-find --json | jq '.can.interfaces[] | {name, up, bit_rate}'",
 )
 @click.argument("buses", nargs=-1, metavar="[BUS]...")
-@click.option("--seconds", "listen_s", type=cli.seconds, default="1", help="Listen for SECONDS.")
+@cli.duration_option("Listen for SECONDS.", default="1")
 @click.option("--probe", is_flag=True, help="Send harmless requests to see which devices answer.")
 @click.option(
     "--driver",
@@ -47,7 +47,7 @@ _MOST_CLASSES = 6
 @cli.json_option
 def command(
     buses: tuple[str, ...],
-    listen_s: float,
+    duration_s: float,
     probe: bool,
     driver_names: tuple[str, ...],
     force: bool,
@@ -66,7 +66,7 @@ def command(
     if udev:
         _print_rules(buses, as_json)
         return
-    found = asyncio.run(look(buses, listen_s, probe=probe, force=force, driver_names=driver_names))
+    found = asyncio.run(look(buses, duration_s, probe=probe, force=force, driver_names=driver_names))
     if as_json:
         print_json(found)
     else:

@@ -45,7 +45,7 @@ def command() -> None:
 @click.option("-o", "--output", metavar="DIR", type=cli.FILE, help="Write files here.")
 @click.option("-f", "--force", is_flag=True, help="Overwrite existing files.")
 @click.option(
-    "--part", "only", multiple=True, metavar="NAME", help="Only the skin device with this name; repeat it for several."
+    "--part", "only", multiple=True, metavar="NAME", help="Only the skin device with this name; may be repeated."
 )
 @click.option(
     "--bus", "buses", multiple=True, metavar="PATCH=NAME", help="Bus that a patch is attached to, such as 1=can0."

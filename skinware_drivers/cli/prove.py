@@ -41,7 +41,7 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
     "skin-prove                                    the only driver that runs",
     "skin-prove hand --only index --only palm      only these modules",
     "skin-prove -- --driver xela --bus can0        start it too: the capture then has its first byte",
-    "skin-prove --wait 60 --json                   for programs; a line 'skip' leaves a module out",
+    "skin-prove --timeout 60 --json                for programs; a line 'skip' leaves a module out",
     "skin-prove --captured hand.mcap               without the device: are the decoded values the same?",
     "skin-prove --captured hand.mcap -- --driver ./my.py",
 )
@@ -50,8 +50,8 @@ _COLOURS = {"passed": "green", "failed": "red", "skipped": "yellow", "not judged
 @click.option(
     "--type", "type_name", metavar="TYPE", help="Sensors to look at.  [default: pressure, force, or the first]"
 )
-@click.option("--only", multiple=True, metavar="WORD", help="Modules with WORD in their name; repeat it for several.")
-@click.option("--wait", "patience_s", type=cli.seconds, default="30", help="SECONDS for each step.")
+@click.option("--only", multiple=True, metavar="WORD", help="Modules with WORD in their name; may be repeated.")
+@click.option("--timeout", "patience_s", type=cli.seconds, default="30", help="Give up a step after SECONDS.")
 @click.option("--rest", "rest_s", type=cli.seconds, default="3", help="Look at the skin at rest for SECONDS.")
 @click.option("--tare", "with_tare", is_flag=True, help="At the end, let the driver tare, if it can.")
 @click.option(

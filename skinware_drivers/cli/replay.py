@@ -71,7 +71,7 @@ def speed_text(text: str) -> float:
     "buses",
     metavar="[RECORDED=]BUS",
     multiple=True,
-    help="With --wire: bus to send on; with several recorded buses, which one: can0=vcan0. Repeat it.",
+    help="With --wire: bus to send on; with several recorded buses, which one: can0=vcan0; may be repeated.",
 )
 def command(
     file: Path,

@@ -121,7 +121,7 @@ def _two_boards(driver: DriverSeen, evidence: Evidence) -> Iterator[Note]:
             yield NotLooked(
                 f"addresses that two boards share ({driver.name})",
                 f"too few updates in {evidence.seconds:.1f} s",
-                (f"skin-doctor --seconds {max(10.0, 2 * evidence.seconds):.0f}",),
+                (f"skin-doctor -T {max(10.0, 2 * evidence.seconds):.0f}",),
             )
         return
     of_period = evidence.seconds * 1e9 / driver.timing.period_ns if driver.timing.period_ns else 0.0

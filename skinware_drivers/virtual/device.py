@@ -201,7 +201,7 @@ class EmulatorOptions(Options, frozen=True):
         Literal["touch", "idle", "cycle"],
         Meta(description="input: a finger that presses here and there, nothing, or each burst's number in every value"),
     ] = "touch"
-    calm_s: Annotated[Seconds, Meta(description="seconds without touch at the begin")] = 0.0
+    calm_s: Annotated[Seconds, Meta(description="seconds without touch at the start")] = 0.0
     seed: Annotated[Count, Meta(description="seed of the touch and of the random faults")] = 0
     streaming: Annotated[bool, Meta(description="send from power-up, as if a host had started the devices")] = False
 

@@ -50,7 +50,7 @@ def test_an_interface_that_is_down_is_told_with_what_to_do(
     one = interface(asyncio.run(look((name,), 0.1)), name)
     assert (one["up"], one["heard"]) == (False, None)
     assert one["advice"] == [f"down: sudo ip link set {name} up"]
-    assert exit_status(command, [name, "--seconds", "0.1"]) == 0
+    assert exit_status(command, [name, "-T", "0.1"]) == 0
     assert f"      sudo ip link set {name} up" in capsys.readouterr().out
 
 

@@ -138,7 +138,7 @@ def test_emulated_from_a_file(write: Write, tmp_path: Path, capsys: pytest.Captu
 def test_found_by_a_file(write: Write, capsys: pytest.CaptureFixture[str]) -> None:
     path = write("finger.py", FINGER)
     bus = f"virtual:{path}"
-    text = told(capsys, find.command, bus, "--driver", path, "--seconds", "0.2")
+    text = told(capsys, find.command, bus, "--driver", path, "-T", "0.2")
     assert "looks like finger: finger (all frames)" in text
     text = told(capsys, find.command, bus, "--driver", f"{path}.py", status=2)
     assert f"driver {path}.py: there is no such file" in text

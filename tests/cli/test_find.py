@@ -26,7 +26,7 @@ from tests.finding.fakes import see_only
 from tests.sdk.driving import driving, emulated
 
 STREAMING = "virtual?boards=7,8&streaming=yes"
-LISTEN = ("--seconds", "0.2")
+LISTEN = ("-T", "0.2")
 COUNTS = dict.fromkeys(interfaces._STATISTICS, 0) | {"rx_packets": 12345, "rx_errors": 7}
 CAN0 = CanInterface("can0", "can", "peak_usb", False, "down", is_fd=True, queue_length=10, statistics=COUNTS)
 FTDI = UsbIdentity("0403", "6001", "A50285BI", "FTDI", "FT232R USB UART", "1-1.2", "00")
@@ -210,7 +210,7 @@ def test_an_emulator_does_not_stand_in_the_way_at_its_own_port(
         (["virtual?board=7"], 2, "did you mean 'boards'"),
         (["nonsense:0"], 2, "no interface 'nonsense'"),
         (["--force"], 2, "--probe"),
-        (["--seconds", "-1"], 2, "seconds"),
+        (["-T", "-1"], 2, "seconds"),
         (["--udev", "can0"], 2, "not a serial port"),
         (["serial:?serial_number=A5"], 1, "there is no serial port"),
         (["tcp://127.0.0.1", "--probe"], 2, "bus tcp://127.0.0.1: which port? Write tcp://HOST:PORT"),

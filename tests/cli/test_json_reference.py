@@ -241,10 +241,10 @@ def test_what_is_found(printing: Print, namespace: Namespace, tmp_path: Path, mo
     tty = SerialPort("/dev/ttyUSB0", "ftdi_sio", usb, ("/dev/skin/A5",), False, "dialout", False, (User(1, "init"),))
     monkeypatch.setattr(interfaces, "can_interfaces", lambda: [can0])
     monkeypatch.setattr(ports, "serial_ports", lambda: [tty])
-    machine = printing(find, "--probe", "--seconds", "0.1")
+    machine = printing(find, "--probe", "-T", "0.1")
     monkeypatch.setattr(interfaces, "can_interfaces", list)
-    heard = printing(find, f"{VIRTUAL}&streaming=yes", "--probe", "--seconds", "1")
-    no_interface = printing(find, "--seconds", "0.1")
+    heard = printing(find, f"{VIRTUAL}&streaming=yes", "--probe", "-T", "1")
+    no_interface = printing(find, "-T", "0.1")
     # what is heard on an interface of the kernel, and who has it, is told as it is for other buses
     owner = {"name": "a", "namespace": "b", "driver_type": "c", "pid": 1, "buses": ["can0"]}
     machine[0]["can"]["interfaces"][0] |= {**heard[0]["buses"][0], "used_by": owner}
@@ -266,7 +266,7 @@ def test_what_a_doctor_finds(printing: Print, tmp_path: Path) -> None:
         with running("skin-record", "torso", "-o", str(file)) as record:
             record.wait_for("status", lambda status: bool(status["messages"]))
             record.stop()
-        live = printing(doctor, "--seconds", "0.2", status=1)
+        live = printing(doctor, "-T", "0.2", status=1)
     check("`skin-doctor`", *live, *printing(doctor, str(file), status=1))
 
 
@@ -463,7 +463,7 @@ def test_press(printing: Print) -> None:
 def test_a_capture_and_a_proof(tmp_path: Path) -> None:
     with running("skin-driver", "--driver", "xela", "--bus", "virtual", "--capture", f"{tmp_path}/it.mcap") as driver:
         driver.wait_for("ready")
-        options = ("--rest", "1", "--wait", "0.1", "--only", "taxel 3", "--only", "xela", "-o", f"{tmp_path}/proof")
+        options = ("--rest", "1", "--timeout", "0.1", "--only", "taxel 3", "--only", "xela", "-o", f"{tmp_path}/proof")
         with running("skin-prove", "xela", *options) as prove:
             step = prove.wait_for("step")
             done = prove.wait_for("done")

@@ -40,7 +40,7 @@ def test_a_driver_shows_the_press_where_its_geometry_says(capsys: pytest.Capture
             taxels = geometry.of(structure, "pressure")
             x, y, z = map(str, taxels.position_m[201])
             idle = read_until(reader, lambda frame: not frame.status.any()).physical("pressure")
-            done = run("skin-press", x, y, z, "--force", "4", "--seconds", "30", "--radius", "0.001")
+            done = run("skin-press", x, y, z, "--newtons", "4", "--seconds", "30", "--radius", "0.001")
             assert (done.returncode, done.stderr) == (0, "")
             assert f"roboskin on {IDLE}: 4 N for 30 s; the nearest taxel: board 8, triangle 4" in done.stdout
             assert done.stdout.endswith("0.0 mm away\n")
@@ -94,7 +94,7 @@ def test_of_several_one_must_be_named(capsys: pytest.CaptureFixture[str]) -> Non
         assert pressed(capsys, "0.07", "0.0225", "0", "--name", "two").startswith("two on ")
 
 
-@pytest.mark.parametrize("arguments", [["0", "0"], ["0", "0", "up"], ["0", "0", "0", "--force", "hard"]])
+@pytest.mark.parametrize("arguments", [["0", "0"], ["0", "0", "up"], ["0", "0", "0", "--newtons", "hard"]])
 def test_wrong_usage_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert "Usage: skin-press" in pressed(capsys, *arguments, status=2)
 
@@ -107,7 +107,7 @@ def test_an_emulator_without_places_has_no_service(capsys: pytest.CaptureFixture
     assert namespace.services() == []
 
 
-def test_an_emulator_writes_down_where_its_sensors_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_emulator_writes_down_where_its_sensors_are(tmp_path: Path) -> None:
     file = tmp_path / "arm.toml"
     arguments = ["--bus", BUS, "--boards", "7,9", "--geometry", str(file), "-T", "0"]
     assert exit_status(emulate, arguments) == 0
@@ -117,4 +117,3 @@ def test_an_emulator_writes_down_where_its_sensors_are(tmp_path: Path, capsys: p
     assert (set(written.frame), written.uid.tolist()) == ({"arm"}, own.uid.tolist())
     for name in ("position_m", "normal", "radius_m"):
         assert np.allclose(getattr(written, name), getattr(own, name))
-    capsys.readouterr()

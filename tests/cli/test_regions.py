@@ -163,7 +163,7 @@ def test_what_cannot_be_painted_is_told(tmp_path: Path, capsys: pytest.CaptureFi
     here = ["paint", "palm", "-o", str(file), "-T", "0.1"]
     for arguments, status, why in (
         (here, 1, "no driver runs in namespace"),
-        ([*here, "--driver", "arm"], 1, "no service 'arm'"),
+        ([*here, "arm"], 1, "no service 'arm'"),
         (here[:-2], 2, "without a terminal there is no Enter: give -T SECONDS"),
     ):
         done = run("skin-regions", *arguments)
@@ -173,7 +173,7 @@ def test_what_cannot_be_painted_is_told(tmp_path: Path, capsys: pytest.CaptureFi
     with publishing(quiet):
         with publishing(other):
             assert exit_status(command, here) == 2
-            assert "several drivers run: choose one with --driver: arm, torso" in capsys.readouterr().err
+            assert "choose one with skin-regions paint NAME DRIVER: arm, torso" in capsys.readouterr().err
         assert exit_status(command, [*here, "--type", "shear_x"]) == 1
         assert "no sensor type 'shear_x'" in capsys.readouterr().err
         assert exit_status(command, here) == 1

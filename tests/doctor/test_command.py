@@ -30,8 +30,8 @@ def test_the_worst_comes_first_and_everything_fits_80_columns(capsys: pytest.Cap
     skin.break_some()
     skin.patch_state[1] = PatchState.EXPECTED
     with publishing(skin):
-        text = printed(capsys, "--seconds", "0.2", status=1)
-        data: dict[str, Any] = json.loads(printed(capsys, "--seconds", "0.2", "--json", status=1))
+        text = printed(capsys, "-T", "0.2", status=1)
+        data: dict[str, Any] = json.loads(printed(capsys, "-T", "0.2", "--json", status=1))
     lines = text.splitlines()
     assert re.match(r"\d errors?, .*\(namespace test-", lines[0])
     assert all(len(line) <= 80 or line.lstrip().startswith("$ ") for line in lines), text
@@ -48,7 +48,7 @@ def test_the_worst_comes_first_and_everything_fits_80_columns(capsys: pytest.Cap
 
 def test_nothing_found_is_said_with_status_0(capsys: pytest.CaptureFixture[str]) -> None:
     with publishing(FakeSkin("torso")):
-        text = printed(capsys, "--seconds", "0.2", status=0)
+        text = printed(capsys, "-T", "0.2", status=0)
     assert text.startswith("nothing found  (namespace ")
     assert "torso: can0: live" in text
 
@@ -71,7 +71,7 @@ def test_what_is_no_recording_is_one_clear_line(name: str, tmp_path: Path, capsy
 
 @pytest.mark.thorough
 def test_bad_arguments() -> None:
-    for arguments in (["--seconds", "soon"], ["--seconds", "-1"], ["no-such.mcap"], ["--namespace", "a/b"]):
+    for arguments in (["-T", "soon"], ["-T", "-1"], ["no-such.mcap"], ["--namespace", "a/b"]):
         done = run("skin-doctor", *arguments)
         assert done.returncode == 2, arguments
         assert "Traceback" not in done.stderr
@@ -80,7 +80,7 @@ def test_bad_arguments() -> None:
 def test_it_changes_nothing_and_is_no_reader(namespace: Namespace) -> None:
     with publishing(FakeSkin("torso")):
         before = {path.name for path in namespace.path.rglob("*")}
-        assert exit_status(command, ["--seconds", "0.1", "--json"]) == 0
+        assert exit_status(command, ["-T", "0.1", "--json"]) == 0
         assert {path.name for path in namespace.path.rglob("*")} == before
 
 

@@ -90,7 +90,7 @@ def test_a_whole_report_has_none_of_what_was_planted(
     file = tmp_path / "report.md"
     with publishing(skin):
         (namespace.path / "hunter2.ring").write_bytes(b"x")
-        assert exit_status(command, ["--seconds", "0.2", "--report", str(file)]) == 1
+        assert exit_status(command, ["-T", "0.2", "--report", str(file)]) == 1
         (namespace.path / "hunter2.ring").unlink()
     assert f"written to {file}" in capsys.readouterr().out
     text = file.read_text()
@@ -117,7 +117,7 @@ def test_it_is_markdown_that_tells_all(namespace: Namespace) -> None:
 
 
 def test_a_report_that_cannot_be_written_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_status(command, ["--seconds", "0", "--report", str(tmp_path / "no/such/report.md")]) == 2
+    assert exit_status(command, ["-T", "0", "--report", str(tmp_path / "no/such/report.md")]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "No such file or directory" in error

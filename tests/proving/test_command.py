@@ -34,7 +34,7 @@ def test_a_program_presses_and_skips(tmp_path: Path) -> None:
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         rest = skin.values = STRUCTURE.sensor_uid * 0 + REST
         prove = subprocess.Popen(
-            [BIN / "skin-prove", "hand", "--json", "--rest", "1", "--wait", "30", "-o", str(stem)],
+            [BIN / "skin-prove", "hand", "--json", "--rest", "1", "--timeout", "30", "-o", str(stem)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -77,7 +77,7 @@ def test_a_program_presses_and_skips(tmp_path: Path) -> None:
 @pytest.mark.thorough
 def test_it_starts_a_driver_and_captures_its_first_byte(tmp_path: Path) -> None:
     stem = tmp_path / "proof"
-    own = ("--rest", "0.3", "--wait", "0.2", "--only", "palm", "-o", str(stem))
+    own = ("--rest", "0.3", "--timeout", "0.2", "--only", "palm", "-o", str(stem))
     missed = run("skin-prove", *own, "--", "--driver", "weiss_wts", "--bus", "virtual")
     assert missed.returncode == 1
     assert "no module of weiss_wts has such a name" in missed.stderr
@@ -104,7 +104,7 @@ def test_whatever_it_asks_for_it_can_be_interrupted(tmp_path: Path, interrupted:
     stem = tmp_path / "proof"
     with publishing(FakeSkin("hand", MATRICES)) as skin, contextlib.ExitStack() as beside:
         rest = skin.values = STRUCTURE.sensor_uid * 0 + REST
-        own = ["--json", "--rest", "30" if interrupted == "rest" else "0.5", "--wait", "60", "-o", str(stem)]
+        own = ["--json", "--rest", "30" if interrupted == "rest" else "0.5", "--timeout", "60", "-o", str(stem)]
         nobody = beside.enter_context(socket.create_server(("127.0.0.1", 0))).getsockname()[1]
         silent = ["--", "--driver", "weiss_wts", "--bus", f"tcp://127.0.0.1:{nobody}"]
         prove = subprocess.Popen(
@@ -159,7 +159,7 @@ def test_interrupted_while_it_tares_or_writes_it_ends_with_a_report(tmp_path: Pa
         may_end.wait(60)
 
     with hand(PressingPerson(), straight(), (), tare):
-        own = ("--json", "--tare", "--rest", "0.5", "--wait", "0.1", "--only", "index", "-o", str(tmp_path / "proof"))
+        own = ("--json", "--tare", "--rest", "0.5", "--timeout", "0.1", "--only", "index", "-o", f"{tmp_path}/proof")
         prove = subprocess.Popen(
             [BIN / "skin-prove", "hand", *own], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True
         )
@@ -194,7 +194,7 @@ def test_a_driver_that_dies_a_full_disk_and_a_lost_report_are_told_of(
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")  # or the limit cuts off the bytecode of what is imported
     with publishing(FakeSkin("hand", STRUCTURE)) as skin:
         skin.values = STRUCTURE.sensor_uid * 0 + REST
-        own = ("--json", "--rest", "0.5", "--wait", "60", "-o", str(tmp_path / "proof"))
+        own = ("--json", "--rest", "0.5", "--timeout", "60", "-o", str(tmp_path / "proof"))
         prove = subprocess.Popen(
             [BIN / "skin-prove", "hand", *own],
             stdin=subprocess.DEVNULL,
@@ -242,7 +242,7 @@ def test_a_driver_whose_author_prints_is_heard_nevertheless(tmp_path: Path, tcp_
         "        print(4)\n"
         "        super().__init__(options)\n"
     )
-    own = ("--rest", "0.3", "--wait", "0.2", "--only", "palm", "-o", str(tmp_path / "proof"))
+    own = ("--rest", "0.3", "--timeout", "0.2", "--only", "palm", "-o", str(tmp_path / "proof"))
     bus = f"tcp://{tcp_patch('weiss_wts')}"
     missed = run("skin-prove", *own, "--", "--driver", str(tmp_path / "noisy.py"), "--bus", bus)
     assert missed.returncode == 1

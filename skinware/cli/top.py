@@ -92,6 +92,7 @@ def command(
 def show_lines(
     namespace: Namespace, duration_s: float | None, as_json: bool = False, names: Sequence[str] = ()
 ) -> None:
+    from skinware.cli import _top_rows  # noqa: F401 - before the first look, whose samples would age meanwhile
     from skinware.views.live import Overview
 
     overview = Overview(namespace, names)

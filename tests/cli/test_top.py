@@ -132,6 +132,16 @@ def test_the_live_view_is_loaded_only_when_it_is_needed() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+def test_nothing_is_imported_between_the_first_look_and_its_lines(namespace: Namespace) -> None:
+    code = (
+        "import sys; from skinware import Namespace; from skinware.cli.top import show_lines;"
+        "from skinware.views.live import Overview;"
+        "Overview.look = lambda _: sys.exit('skinware.cli._top_rows' not in sys.modules);"
+        f"show_lines(Namespace('{namespace.name}'), 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_a_region_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "regions.toml"
     put_region(file, Region("palm", uid=(1,)))

@@ -133,7 +133,3 @@ def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:
 
 
 main = partial(cli.run, command, goes_on=True)
-
-
-if __name__ == "__main__":
-    main()

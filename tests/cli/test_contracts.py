@@ -133,7 +133,6 @@ def test_output_into_a_pipe_that_closes_is_no_error() -> None:
         (["--bus", "virtual", "--config", "/no/such/file.toml"], 2, "/no/such/file.toml"),
         (["--bus", "virtual", "--slots", "1"], 2, "slots"),
         (["--bus", "can0", "--bus", "socketcan:can0"], 2, "bus socketcan:can0 is named twice"),
-        (["--nonsense"], 2, "No such option"),
         ([], 2, "which bus?"),
     ],
 )

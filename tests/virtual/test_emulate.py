@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +23,7 @@ from skinware_drivers.cli.emulation import Emulation, SignalWatch, report_to, wa
 from skinware_drivers.options import describe_options
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
+from tests.commands import BIN
 
 from .rig import MS, START_NS
 
@@ -371,9 +371,8 @@ def test_exit_status(arguments: tuple[str, ...], status: int, message: str, caps
 def test_a_signal_ends_the_command_with_status_0(number: signal.Signals, tmp_path: Path) -> None:
     """The whole command in a process of its own, on a bus that needs no kernel support."""
     log = tmp_path / "log.jsonl"
-    emulate = [sys.executable, "-m", "skinware_drivers.cli.emulate"]
     arguments = ["--driver", "anyskin", "--bus", "pty", "--json", "--log", str(log)]
-    with subprocess.Popen([*emulate, *arguments], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen([BIN / "skin-emulate", *arguments], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert json.loads(process.stdout.readline())["event"] == "ready"
         process.send_signal(number)

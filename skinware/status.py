@@ -96,7 +96,7 @@ class Why(enum.IntEnum):
     RELEARNING = 2
     """Its offset is not known yet, or less well than its noise."""
     COVERED = 3
-    """It is below its offset, which was learned under a load or before a cover sank nearby."""
+    """It is far from its offset, which was learned under a load or before a cover sank nearby."""
     DOUBTED = 4
     """It falls and returns again and again where nothing touches: its polarity may be wrong."""
     SATURATED = 5

@@ -111,6 +111,7 @@ struct module {
     double begun_s; /* how long ago the newest touch began on it */
     double touched; /* number of its taxels */
     double near;    /* 1: something touches it */
+    double rises;   /* 1: a new touch is on it, and not where the taxel fell from */
     double looked;  /* a touch on it is looked at: touches.c has when */
     double median, onset, slow, on, off, number, alike; /* of a module that is looked at */
     double living, speed2; /* number of its taxels with values, sum of the squares of their speeds */
@@ -127,6 +128,7 @@ struct baseline {
     /* settings; minimum_on: NaN where none is given */
     double tau_s, settle_s, smooth_s, on_sigma, off_sigma, minimum_on, recover_s, maximum_hold_s, calibrate_s;
 
+    struct baseline *normal; /* of the axis along the normal of the same taxels, if this is an axis within the skin */
     struct run *runs;
     struct patch *patches;
     struct module *modules;

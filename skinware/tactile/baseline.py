@@ -30,7 +30,8 @@ from skinware.tactile.arrays import Bytes, Flags, Floats, check_state
 
 UNUSABLE = Status.NEVER_SEEN | Status.STALE | Status.MASKED | Status.NOT_CONNECTED
 """A value with one of these bits is not of its frame."""
-SIGNED_TYPES = ("shear_", "force_x", "force_y", "magnetic_field_", "acceleration_", "angular_rate_")
+_FORCES = tuple(f"{of}_{axis}" for of in ("force", "resultant", "total_force") for axis in "xy")
+SIGNED_TYPES = ("shear_", *_FORCES, "torque_", "magnetic_field_", "dynamic_pressure")
 """Beginnings of the names of types that a touch may move to both sides."""
 
 FORGET_AFTER_S = 600.0
@@ -42,7 +43,7 @@ def resolution_of(structure: Structure, type_name: str) -> float:
     return 0.0 if structure.dtype.kind == "f" else abs(structure.type(type_name).scale)
 
 
-_MAY_BE_NONE = ("minimum_on", "maximum_hold_s")
+_WHERE_NONE = {"minimum_on": math.nan, "maximum_hold_s": math.inf}
 
 
 class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -96,7 +97,7 @@ class BaselineSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
             if name not in self.__struct_fields__:
                 raise ConfigurationError(f"no setting {name!r}; there are: {', '.join(self.__struct_fields__)}")
             is_number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not is_number and not (value is None and name in _MAY_BE_NONE):
+            if not is_number and not (value is None and name in _WHERE_NONE):
                 raise ConfigurationError(f"{name} = {value!r}: give a number")
         return msgspec.structs.replace(self, **changes)
 
@@ -105,7 +106,6 @@ _STRUCTS = read_structs([Path(native.__file__).with_name("baseline.h")])
 _BLOCKS = 60  # numbers of a taxel that is measured
 SHOWN = 21
 """Bytes of a taxel that the library shows."""
-_WHERE_NONE = {"minimum_on": math.nan, "maximum_hold_s": math.inf}
 _NO_VALUE, _NO_NOISE = -1, -2
 _LEARNED = (
     *("ready", "level", "gain", "variance", "cross", "noise2", "gain_variance"),
@@ -260,6 +260,10 @@ class Baseline:
         )
         baseline.type_name = type_name
         return baseline
+
+    def stand_beside(self, normal: Baseline) -> None:
+        """Let the axis along the normal of the same n taxels say where these axes, within the skin, bear no load."""
+        self._normal, self._words.normal = normal, normal.at
 
     @property
     def ready(self) -> Flags:

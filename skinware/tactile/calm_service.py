@@ -217,7 +217,7 @@ class CalmService:
             "restored": self.restored,
             "ready": {name: int(stage.baseline.ready.sum()) for name, stage in stages.items()},
             "refused": {name: stage.baseline.refused_share for name, stage in stages.items()},
-            "touched": {name: int(stage.touched.sum()) for name, stage in stages.items()},
+            "touched": {name: int(stage.shown.touched.sum()) for name, stage in stages.items()},
             "why": {name: count_reasons(stage.calm.why) for name, stage in stages.items() if stage.calm is not None},
             "contacts": 0 if self.contacts.newest is None else len(self.contacts.newest[0]),
             "faulty": self.health.faulty,

@@ -21,7 +21,7 @@ from skinware.errors import ConfigurationError
 from skinware.native import give_arrays
 from skinware.sensor_types import NOT_TOUCH
 from skinware.structure import Structure
-from skinware.tactile.arrays import Arrays, Bytes, Flags, Floats, part_of
+from skinware.tactile.arrays import Arrays, Bytes, Floats, part_of
 from skinware.tactile.baseline import SHOWN, UNUSABLE, Baseline, BaselineSettings, Calm
 from skinware.tactile.curves import TEMPERATURE, CurveSettings, CurveStage, temperature_of
 from skinware.tactile.stages import STRUCTS, AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
@@ -90,11 +90,6 @@ class BaselineStage(Stage):
         memory = np.zeros(SHOWN * len(taxels), np.uint8)
         self.shown = Calm.of(memory)
         self._to = self.given.ctypes.data, memory.ctypes.data
-
-    @property
-    def touched(self) -> Flags:
-        """(n,) bool, which taxels are touched in the newest sample."""
-        return np.zeros(len(self.taxels), bool) if self.calm is None else self.calm.touched
 
     def step(self, signal: Signal) -> None:
         _calm(self.baseline.at, signal.at, signal.time_ns, *self._to)
@@ -247,6 +242,9 @@ class Chain:
                     self.baseline_stages.setdefault(name, stage)
                 elif isinstance(stage, CurveStage):
                     self.curve_stages[name] = stage
+        for *within, normal in vectors_of({name: stage.before for name, stage in self.baseline_stages.items()}):
+            for name in within if not self.baseline_stages[normal].before.signed else ():
+                self.baselines[name].stand_beside(self.baselines[normal])
         self._learning: list[tuple[str, Learning, str, str]] = []
         for name, baseline in self.baselines.items():
             self.keep(name, baseline, f"{name}/")

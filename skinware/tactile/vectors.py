@@ -25,7 +25,7 @@ from skinware.tactile.stages import Positive, Signal, Stage, StageSettings, Taxe
 AXES = (
     ("magnetic_field_x", "magnetic_field_y", "magnetic_field_z"),
     ("shear_x", "shear_y", "pressure"),
-    ("force_x", "force_y", "force_z"),
+    *((f"{of}_x", f"{of}_y", f"{of}_z") for of in ("force", "resultant", "total_force")),
 )
 """Types that are the axes of one vector, where they have the same taxels."""
 LEAST_ARRAY = 4

@@ -343,6 +343,17 @@ def test_few_taxels_have_no_common_mode_and_feel_after_minutes_and_after_a_press
     assert calm.value == pytest.approx(30, abs=2)
 
 
+def test_a_load_that_was_there_at_the_start_is_felt_when_it_comes_again_with_others() -> None:
+    bench = Bench(noise=0.3)
+    bench.run(8, on(*range(6)))
+    bench.run(4)
+    assert not bench.calm.touched.any()
+    seen: list[npt.NDArray[np.bool_]] = []
+    bench.run(10, on(*range(3, 9)), each=lambda calm: seen.append(calm.touched[3:9]))
+    assert np.mean(seen) > 0.98
+    assert not (bench.calm.why == Why.DOUBTED).any()
+
+
 def test_types_that_a_touch_moves_to_both_sides() -> None:
     bench = Bench(signed=True)
     bench.run(6)

@@ -191,6 +191,30 @@ def test_patches_of_few_taxels() -> None:
     both.compare_states()
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_axes_within_the_skin_that_begin_under_a_load(seed: int) -> None:
+    module, patch = shuffled(seed)
+    along, within = Both(module, patch), Both(module, patch, signed=True)
+    within.ours.stand_beside(along.ours)
+    within.specified.stand_beside(along.specified)
+    random, share = np.random.default_rng(seed), 0.0
+    load = np.where(module == 0, 40.0, 0)
+    for number in range(1, 1000):
+        if number % 80 == 0:
+            first, share = int(random.integers(0, N - 6)), float(random.uniform(-1, 1))
+            load = np.zeros(N)
+            load[first : first + 6] = random.choice([0, 3, 20, 80])
+            for both in (along, within):
+                both.ours.hold(number == 400)
+                both.specified.hold(number == 400)
+        noise = random.standard_normal((2, N))
+        usable = random.random((2, N)) > 0.05 * (number % 200 > 150)
+        pull = 0.2 * np.roll(load, 4) + (share if number >= 80 else 0.6) * load
+        within.update(number * 50_000_000, np.round(pull + 0.6 * noise[0]), usable[0])
+        along.update(number * 50_000_000, np.round(20 + load + 0.6 * noise[1]), usable[1])
+    within.compare_states()
+
+
 @pytest.mark.parametrize("levels", [1, 2])
 def test_taxels_of_few_levels(levels: int) -> None:
     both, random = Both(np.arange(N) // 12, np.arange(N) // 48), np.random.default_rng(levels)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +15,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from skinware import DriverReader, Status, Structure
+from skinware.driver_snapshot import DriverSnapshot
 from skinware.errors import ConfigurationError
-from skinware.sensor_types import PRESSURE, PROXIMITY, TEMPERATURE, SensorType
+from skinware.sensor_types import PRESSURE, PROXIMITY, SHEAR_X, SHEAR_Y, TEMPERATURE, SensorType
 from skinware.tactile.chain import ChainSettings
 from skinware.tactile.curves import MOST_KNOTS, Curve, CurveTable, read_curves
 from skinware.tactile.stages import AmplifierSettings, FilterSettings, ScalerSettings, Signal, Stage, Taxels
@@ -222,6 +225,56 @@ def test_a_chain_says_what_a_baseline_did(tmp_path: Path) -> None:
                 else:
                     assert (status[pressure] == (Status.SUSPECT if step == 1 else 0)).all()
         assert list(chain.baselines) == ["pressure"]
+
+
+@pytest.mark.parametrize(
+    "axes", [(SHEAR_X, SHEAR_Y, PRESSURE), tuple(SensorType(f"resultant_{a}", 1 << 12 | ord(a), "Pa") for a in "xyz")]
+)
+def test_axes_within_the_skin_bear_no_load_without_one_along_the_normal(axes: tuple[SensorType, ...]) -> None:
+    """They are covered at the start; later a load holds some of them, and pulls others that it does not press."""
+    n, types = 24, [axis.measured(unit="counts", minimum=-500, maximum=500) for axis in axes]
+    structure = Structure(
+        types=types,
+        buses=["can0"],
+        patch_name=["palm"],
+        patch_bus=[0],
+        module_patch=[0, 0],
+        module_kind=["pad"] * 2,
+        sensor_uid=[*range(n)] * 3,
+        sensor_type=np.repeat([one.id for one in types], n),
+        sensor_module=np.arange(3 * n) % n // 12,
+        dtype="i2",
+    )
+    chain, random = ChainSettings.calm().chain(structure), np.random.default_rng(1)
+    rows = [structure.index(one.name) for one in types]
+    shown, status = np.zeros(3 * n, np.float32), np.zeros(3 * n, np.uint8)
+
+    def run(first_s: int, last_s: int, *loads: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """Return (types, n) the shares of these seconds in which each is touched."""
+        seen = []
+        for number in range(50 * first_s, 50 * last_s):
+            values = 5 + 0.6 * random.standard_normal(3 * n)
+            for of, load in zip(rows, loads, strict=False):
+                values[of] += load
+            sample = SimpleNamespace(
+                acquired_ns=number * 20 * MS, physical_values=lambda v=values: np.round(v), status=status * 0
+            )
+            chain.step(cast(DriverSnapshot, sample), shown, status)
+            seen.append([chain.baseline_stages[one.name].shown.touched.copy() for one in types])
+        share: npt.NDArray[np.float64] = np.mean(seen, axis=0)
+        return share
+
+    pressed = 60.0 * (np.arange(n) < 6)
+    run(0, 6, -0.6 * pressed, 0.5 * pressed, pressed)
+    run(6, 9)
+    assert not run(9, 12).any()
+    pressed = 60.0 * (np.abs(np.arange(n) - 7) < 3)
+    beside = 12.0 * (np.arange(n) == 11)
+    touched = run(12, 40, 0.4 * pressed + beside, -0.7 * pressed, pressed)
+    assert touched[:, pressed > 0].min() > 0.98
+    assert touched[0, 11] > 0.98, "the skin is pulled there"
+    run(40, 42)
+    assert not run(42, 44).any()
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ from tests.specification.baseline.numbers import (
     NEARLY_ALL,
     OFF_TO_ON,
     RESETTLE_S,
+    SAG_SHARE,
     STEPS_OF_A_TOUCH,
     TINY,
 )
@@ -139,6 +140,12 @@ class SpecifiedBaseline:
         """By how much each patch jumped down of late, and how long ago."""
         self._forced: Flags = np.zeros(n, bool)
         self._suspect: Flags | None = None
+        self._normal: SpecifiedBaseline | None = None
+        self._live, self._off = np.zeros(n, bool), np.zeros(n, np.float32)
+
+    def stand_beside(self, normal: SpecifiedBaseline) -> None:
+        """Let the axis along the normal of the same taxels say where these axes, within the skin, bear no load."""
+        self._normal = normal
 
     @property
     def ready(self) -> Flags:
@@ -230,11 +237,11 @@ class SpecifiedBaseline:
         intake.take(given, usable)
         if not self._ready.all():
             self._measure(time_ns, usable, passed_s)
-        live = usable & self._ready
+        live = self._live = usable & self._ready
         deviation = np.where(live, intake.last - offsets.level - touches.remainders.left, np.float32(0))
         spread = np.sqrt(offsets.noise2)
         on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
-        off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
+        off = self._off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
         if not touches.signed:
             self._jump(deviation, live, off, passed_s)
         free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end()
@@ -377,12 +384,24 @@ class SpecifiedBaseline:
         """Give new offsets to taxels whose old ones were learned under a load that is gone now."""
         touches = self._touches
         if touches.signed:
-            return np.zeros_like(live)
-        low = live & (touches.smooth < -on)
-        due = self._falls.recovered(low, touches.smooth, passed_s, self._settings.recover_s)
+            low = live & touches.touched & self._rests_beside()
+            due = np.flatnonzero(self._falls.lasts(low, passed_s, self._settings.recover_s))
+        else:
+            low = live & (touches.smooth < -on)
+            due = self._falls.recovered(low, touches.smooth, passed_s, self._settings.recover_s)
         if len(due) and not self._all_held:
             self._put(due, touches.smooth[due], deviation)
+            touches.end(due[touches.touched[due]])
         return low
+
+    def _rests_beside(self) -> Flags | np.bool_:
+        """Return (n,) where these axes show more than a pull of the skin, and the axis along the normal rests."""
+        normal = self._normal
+        if normal is None:
+            return np.False_
+        pull = SAG_SHARE * normal._surroundings.largest[normal._surroundings.patch]
+        more: Flags = np.abs(self._touches.smooth) > np.maximum(normal._off, pull)
+        return more & normal._live & ~normal._touches.touched & (normal._touches.smooth < normal._off)
 
     def _put(self, taxels: Rows, by: Floats, deviation: Floats) -> None:
         """Move the offsets of k taxels at once."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from tests.specification.baseline.numbers import DIP_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
+from tests.specification.baseline.numbers import DIP_S, LOOK_AT_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
 from tests.specification.baseline.offsets import Grouping
 from tests.specification.baseline.touches import Touches
 
@@ -135,14 +135,19 @@ class Falls:
 
     def recovered(self, low: Flags, smooth: Floats, passed_s: float, after_s: float) -> Rows:
         """Return the taxels that are far below their offsets for ``after_s``, or below while no cover pulls."""
-        self._below_s = np.where(low, self._below_s + np.float32(passed_s), np.float32(0))
-        due = self._below_s >= max(after_s, 1e-9)
+        due = self.lasts(low, passed_s, after_s)
         if self._around.largest.any():
             due &= -smooth > SAG_SHARE * self._around.largest[self._around.patch]
         due |= self.lowered > 0
         self._below_s[due] = self.lowered[due] = 0
         self._dip[due], self._dip_s[due] = -smooth[due], 0
         return np.flatnonzero(due)
+
+    def lasts(self, low: Flags, passed_s: float, after_s: float) -> Flags:
+        """Return (n,) the taxels that have been low for ``after_s``."""
+        self._below_s = np.where(low, self._below_s + np.float32(passed_s), np.float32(0))
+        lasts: Flags = self._below_s >= max(after_s, 1e-9)
+        return lasts
 
     def back(self, touches: Touches, on: Floats, passed_s: float) -> Rows:
         """Return the new touches that are none: the taxels return to where they fell from, or sagged from."""
@@ -156,9 +161,12 @@ class Falls:
         if not looked.any():
             return np.zeros(0, np.intp)
         rows = np.flatnonzero(looked)
-        returns = (
-            ~self._felt[rows] & (self._dip[rows] > 0) & (np.abs(touches.smooth[rows] - self._dip[rows]) < on[rows])
+        is_at_dip = (self._dip > 0) & (np.abs(touches.smooth - self._dip) < on)
+        rises = np.zeros(self._around.n_modules, bool)
+        rises[self._around.module[touches.touched & (touches.contact_s < np.float32(2 * LOOK_AT_S)) & ~is_at_dip]] = (
+            True
         )
+        returns = ~self._felt[rows] & is_at_dip[rows] & ~rises[self._around.module[rows]]
         dipped = rows[returns]
         self.returned[dipped] = np.minimum(self.returned[dipped], 254) + 1
         self._dip[dipped] = 0

@@ -1,19 +1,21 @@
 """``skin-emulate``: emulate skin patches on a bus that other programs use.
 
-The command line takes the emulator's options beside a few of its own; :mod:`.emulation` does the work.
+It takes the emulator's options beside a few of its own; ``skinware_drivers.virtual.emulation`` does the work.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import click
 
 from skinware.cli import _command as cli
+from skinware.cli._terminal import json_text, shown
 from skinware.errors import ConfigurationError
 from skinware_drivers.cli.hardware_options import HardwareCommand, hardware_values
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
     import msgspec
 
+    from skinware_drivers.virtual.emulation import Report
     from skinware_drivers.virtual.hardware import EmulatedHardware, PlacedHardware
 
 _DEFAULT_DRIVER = "roboskin"
@@ -86,10 +89,10 @@ def command(
     from skinware.memory.namespace import Namespace
     from skinware_drivers.bus import kind_of_bus
     from skinware_drivers.bus_names import parse_bus_name
-    from skinware_drivers.cli.emulation import Emulation, PressingService, SignalWatch, report_to
     from skinware_drivers.loading import short_name
     from skinware_drivers.options import options_from_strings
     from skinware_drivers.registry import load_driver, make_bus
+    from skinware_drivers.virtual.emulation import Emulation, PressingService
     from skinware_drivers.virtual.hardware import JsonLinesLog, load_emulator, medium_of
 
     if parse_bus_name(bus_name).interface == "virtual":
@@ -122,6 +125,50 @@ def command(
         emulation = Emulation(bus, hardware, report_to(sys.stdout, as_json=as_json), pressing=pressing)
         signals = open_things.enter_context(SignalWatch())
         emulation.run(signals, bus_name=bus_name, driver=short_name(driver), options=options, duration_s=duration_s)
+
+
+def report_to(stream: TextIO, *, as_json: bool) -> Report:
+    """Return a function that prints events: all of them for programs, without ``status`` for people."""
+
+    def report(name: str, **facts: Any) -> None:
+        if as_json or name != "status":
+            stream.write((json_text({"event": name, **facts}) if as_json else shown(_in_words(name, facts))) + "\n")
+            stream.flush()
+
+    return report
+
+
+def _in_words(name: str, facts: Mapping[str, Any]) -> str:
+    if name == "ready":
+        note = f" ({facts['note']})" if facts.get("note") else ""
+        return f"emulating {facts['driver']} on {facts['bus']}{note}; Ctrl-C stops"
+    if name == "stopped":
+        return "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
+    return f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
+
+
+class SignalWatch:
+    """Turn SIGINT and SIGTERM into a readable descriptor, so that no wait needs to be interrupted."""
+
+    def __init__(self) -> None:
+        self.stopped: bool = False
+        self._bell = os.eventfd(0, os.EFD_CLOEXEC)
+        self._handlers = cli.signals_end(self._stop)
+
+    def __enter__(self) -> Self:
+        self._handlers.__enter__()
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._handlers.__exit__(None, None, None)
+        os.close(self._bell)
+
+    def fileno(self) -> int:
+        return self._bell
+
+    def _stop(self) -> None:
+        self.stopped = True
+        os.eventfd_write(self._bell, 1)
 
 
 def _placed(hardware: EmulatedHardware, option: str) -> PlacedHardware:

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 from skinware.driver_service import DriverReader
 from skinware_drivers.adapter import AnyAdapter
 from skinware_drivers.bus import Bus
-from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.options import NoOptions, options_of
 from skinware_drivers.registry import load_driver, make_bus
 from skinware_drivers.running.building import PublishMode
@@ -23,6 +22,7 @@ from skinware_drivers.serial.bus import PtyBus
 from skinware_drivers.streams.tcp import TcpServerBus
 from skinware_drivers.testing.waiting import SLOWER, defect, require
 from skinware_drivers.virtual.bus import VirtualCanBus
+from skinware_drivers.virtual.emulation import Emulation
 from skinware_drivers.virtual.hardware import EmulatedHardware, load_emulator
 
 _LONGEST_S = 15.0 * SLOWER

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from skinware import DriverReader
-from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.registry import load_driver, make_bus
+from skinware_drivers.virtual.emulation import Emulation
 from skinware_drivers.virtual.hardware import load_emulator
 from tests.sdk.driving import driving_lines, read_until
 

@@ -248,7 +248,8 @@ def fingertip_trial() -> tuple[list[list[int]], str]:
 def replay(bus_name: str, slices: Sequence[Sequence[int]], ready: Any, read: Any) -> None:
     """Fingertips of board 1 send the slices, one per cycle; the first one until somebody reads, at the end the last."""
     from skinware_drivers.can.socketcan import SocketCanBus
-    from skinware_drivers.cli.emulation import Emulation, SignalWatch
+    from skinware_drivers.cli.emulate import SignalWatch
+    from skinware_drivers.virtual.emulation import Emulation
     from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
     from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 

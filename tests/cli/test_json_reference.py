@@ -32,7 +32,7 @@ from skinware.tactile.calibration.state import PressSession
 from skinware_drivers.cli.config import command as config
 from skinware_drivers.cli.doctor import command as doctor
 from skinware_drivers.cli.dump import command as dump
-from skinware_drivers.cli.emulation import Emulation, report_to
+from skinware_drivers.cli.emulate import report_to
 from skinware_drivers.cli.find import command as find
 from skinware_drivers.cli.import_ import command as import_
 from skinware_drivers.cli.replay import command as replay
@@ -40,6 +40,7 @@ from skinware_drivers.finding import interfaces, ports
 from skinware_drivers.finding.interfaces import CanInterface
 from skinware_drivers.finding.ports import SerialPort, UsbIdentity, User
 from skinware_drivers.testing.waiting import read_until, wait_until
+from skinware_drivers.virtual.emulation import Emulation
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 from tests.cli.fake_skin import FakeSkin, publishing
@@ -477,8 +478,7 @@ def _compared(file: str, *options: str) -> Any:
 
 
 def test_an_emulation() -> None:
-    out = io.StringIO()
-    bus = HostBus()
+    out, bus = io.StringIO(), HostBus()
     stop = _Stop(bus)
     options = EmulatedRoboskinOptions(boards=(7,), streaming=True)
     report = report_to(out, as_json=True)

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 
 from skinware.errors import SkinwareError
-from skinware_drivers.cli.emulation import Emulation
 from skinware_drivers.registry import make_bus
 from skinware_drivers.testing.waiting import SLOWER, wait_until
+from skinware_drivers.virtual.emulation import Emulation
 from skinware_drivers.virtual.hardware import WireFrame, load_emulator, medium_of
 
 Mode = Literal["sound", "flood", "doubled"]

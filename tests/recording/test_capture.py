@@ -100,8 +100,7 @@ def test_what_nobody_understands_is_captured(tmp_path: Path) -> None:
     with skinware.recording.open(path) as recording:
         assert {item.is_sent for item in items_of(recording)} == {True, False}
         assert recording.about("barrett")["driver_type"] == "barrett"
-    again = refused("skin-prove", "--captured", str(path))
-    assert (again.returncode, "nothing was decoded then, 0 updates are now" in again.stderr) == (2, True)
+    assert "nothing was decoded then, 0 updates are now" in refused("skin-prove", "--captured", str(path)).stderr
 
 
 @pytest.mark.thorough

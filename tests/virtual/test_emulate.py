@@ -18,9 +18,9 @@ from skinware.cli._command import exit_status
 from skinware.errors import BusNotAvailable, BusSendError, ConfigurationError
 from skinware_drivers import registry
 from skinware_drivers.bus import Bus, FrameBatch
-from skinware_drivers.cli.emulate import command
-from skinware_drivers.cli.emulation import Emulation, SignalWatch, report_to, wait_readable
+from skinware_drivers.cli.emulate import SignalWatch, command, report_to
 from skinware_drivers.options import describe_options
+from skinware_drivers.virtual.emulation import Emulation, wait_readable
 from skinware_drivers.virtual.roboskin.skin import EmulatedRoboskin
 from skinware_drivers.virtual.roboskin.touch import EmulatedRoboskinOptions
 from tests.commands import BIN

@@ -1,20 +1,17 @@
-"""Carry the frames of emulated hardware over a bus in real time, until a signal; and let programs press it."""
+"""Carry the frames of emulated hardware over a bus in real time, and let programs press it."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, Self, TextIO
+from collections.abc import Callable
+from typing import Protocol
 
 import msgspec
 import numpy as np
 
-from skinware.cli._command import signals_end
-from skinware.cli._terminal import json_text, shown
 from skinware.errors import BusNotAvailable, BusSendError
 from skinware.memory.namespace import Namespace
 from skinware.memory.schema import Column
@@ -41,50 +38,6 @@ _FIRST_BACKOFF_NS, _LONGEST_BACKOFF_NS = 100_000_000, 2_000_000_000
 
 Report = Callable[..., None]
 """Receives the events of an emulation: ready, status, bus_down, bus_up, stopped; with facts as keywords."""
-
-
-def report_to(stream: TextIO, *, as_json: bool) -> Report:
-    """Return a function that prints events: all of them for programs, without ``status`` for people."""
-
-    def report(name: str, **facts: Any) -> None:
-        if as_json or name != "status":
-            stream.write((json_text({"event": name, **facts}) if as_json else shown(_in_words(name, facts))) + "\n")
-            stream.flush()
-
-    return report
-
-
-def _in_words(name: str, facts: Mapping[str, Any]) -> str:
-    if name == "ready":
-        note = f" ({facts['note']})" if facts.get("note") else ""
-        return f"emulating {facts['driver']} on {facts['bus']}{note}; Ctrl-C stops"
-    if name == "stopped":
-        return "stopped: " + ", ".join(f"{key} {value}" for key, value in facts.items())
-    return f"{name.replace('_', ' ')}: {facts.get('reason', '')}".rstrip(": ")
-
-
-class SignalWatch:
-    """Turn SIGINT and SIGTERM into a readable descriptor, so that no wait needs to be interrupted."""
-
-    def __init__(self) -> None:
-        self.stopped: bool = False
-        self._bell = os.eventfd(0, os.EFD_CLOEXEC)
-        self._handlers = signals_end(self._stop)
-
-    def __enter__(self) -> Self:
-        self._handlers.__enter__()
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self._handlers.__exit__(None, None, None)
-        os.close(self._bell)
-
-    def fileno(self) -> int:
-        return self._bell
-
-    def _stop(self) -> None:
-        self.stopped = True
-        os.eventfd_write(self._bell, 1)
 
 
 class Stop(Protocol):

@@ -48,12 +48,12 @@ def check_timing(evidence: Evidence) -> Iterator[Note]:
         if not evidence.drivers:
             seen = f"there is none in /dev/shm/skinware.{evidence.namespace}"
             if evidence.running:
-                seen += f"; elsewhere: {', '.join(map(str, evidence.running))}"
+                seen += f"; running now: {', '.join(map(str, evidence.running))}"
             if evidence.waiting:
                 pids = ", ".join(map(str, evidence.waiting))
                 seen += f"; skin-driver runs (pid {pids}), and has found no device so far"
-            elsewhere = {"elsewhere": evidence.running[0].namespace} if evidence.running else {}
-            yield RULES["driver"]["none"].found(f"namespace {evidence.namespace}", seen, **elsewhere)
+            running = {"running": evidence.running[0].namespace} if evidence.running else {}
+            yield RULES["driver"]["none"].found(f"namespace {evidence.namespace}", seen, **running)
         by_s = evidence.machine.clock_set_s
         change = f"set by {by_s:+.1f} s meanwhile" if abs(by_s) > _SET_S else "not set meanwhile"
         yield Looked("wall clock", f"{change}; times of data come from a clock that cannot be set")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import signal
@@ -17,6 +18,7 @@ from skinware import BusReason, BusState, DriverWriter, Namespace, Status
 from skinware.realtime import now_ns
 from skinware_drivers.doctor.examining import examine
 from skinware_drivers.doctor.rules import Finding, Severity
+from skinware_drivers.finding.running import RunningDriver
 from skinware_drivers.testing.driving import EmulatedSkin, emulated_skin
 from skinware_drivers.testing.waiting import read_until
 from skinware_drivers.virtual.bus import VirtualCanBus
@@ -58,7 +60,10 @@ def test_what_was_looked_at_and_what_could_not_be_is_told(skins: Skins) -> None:
     assert "these were" in not_looked["stuck taxels of skin"].why
 
 
-def test_no_driver_at_all() -> None:
+def test_no_driver_at_all_or_one_that_began_too_late(namespace: Namespace) -> None:
+    late = RunningDriver("arm", namespace.name, "roboskin", 5, ())
+    (finding,) = examine(dataclasses.replace(looked(0.0), running=(late,))).findings
+    assert f"; running now: driver 'arm' (namespace {namespace.name}, pid 5)" in finding.evidence
     (finding,) = found(0.0)
     assert (finding.area, finding.severity) == ("timing", Severity.ERROR)
     assert finding.what == "no driver has published anything"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import tempfile
 import threading
 import tty
 from collections.abc import Iterator, Sequence
@@ -38,13 +39,15 @@ class Line:
     """A device at the end of a pseudo terminal.
 
     Attributes:
-        path: what a driver opens.
+        path: what a driver opens: a link, since another test may get the number of a terminal that went away.
     """
 
     def __init__(self) -> None:
         self.master, slave = os.openpty()
         tty.setraw(slave)
-        self.path = os.ttyname(slave)
+        self._folder = tempfile.TemporaryDirectory()
+        self.path = f"{self._folder.name}/port"
+        os.symlink(os.ttyname(slave), self.path)
         self._slave = slave  # kept open until a driver has it, or nothing could be written
         os.set_blocking(self.master, False)
 
@@ -62,6 +65,7 @@ class Line:
 
     def unplug(self) -> None:
         """Go away."""
+        self._folder.cleanup()
         for fd in (self.master, self._slave):
             if fd >= 0:
                 os.close(fd)

@@ -99,7 +99,7 @@ def two_drivers_and_a_service(file: Path) -> None:
     with (
         FakeSkin("arm", fake_structure(2, dtype="<i4")) as arm,
         FakeSkin("torso") as torso,
-        pose_service() as pose,
+        pose_service(slots=64) as pose,
         recording(file) as recorder,
     ):
         arm.publish()
@@ -113,5 +113,7 @@ def two_drivers_and_a_service(file: Path) -> None:
             if number % 3 == 0:
                 arm.publish()
                 publish_pose(pose, number)
+            if number == 50:  # or a recorder that is held up misses some
+                wait_until(lambda: recorder.messages.get("/skin/torso/frame") == 50)
             time.sleep(0.015)
         wait_until(lambda: recorder.messages.get("/skin/torso/frame") == 75)

@@ -155,6 +155,16 @@ class TimedSkin(FakeSkin):
             self.times_ns.append((before_ns, time.monotonic_ns()))
 
 
+def test_what_came_is_in_the_file_a_quarter_of_a_second_later(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    time_ns = time.monotonic_ns()
+    monkeypatch.setattr("skinware.recording.recorder.now_ns", lambda: time_ns)
+    with recording(path) as recorder, FakeSkin("torso") as skin:
+        skin.publish()
+        wait_until(lambda: recorder._coder.bytes_done > 0)
+        time_ns += NS_PER_S // 4
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame") == 1)
+
+
 def test_the_past_is_kept_and_saved_when_it_is_wanted(path: Path) -> None:
     target, skin = Past(path, 0.6), TimedSkin("torso")
     with recording(path, target) as recorder, publishing(skin):
@@ -172,7 +182,6 @@ def test_the_past_is_kept_and_saved_when_it_is_wanted(path: Path) -> None:
             assert (np.diff(sequence) == 1).all()
             dropped_ns, newest_ns = skin.times_ns[sequence[0] - 2][0], skin.times_ns[sequence[-1] - 1][1]
             assert newest_ns - dropped_ns > 500_000_000, "all samples of the last 0.6 s are kept"
-            assert opened.duration_s < 1.5
 
 
 @pytest.mark.thorough

@@ -82,15 +82,15 @@ def test_record_replay_record_is_the_same(tmp_path: Path, namespace: Namespace) 
 def test_readers_and_skins_read_it_as_if_it_lived(tmp_path: Path) -> None:
     file = tmp_path / "skin.mcap"
     with recording(file) as recorder, FakeSkin("torso") as torso:
-        for _ in range(100):
+        for _ in range(60):  # its ring has more slots: a recorder that is held up misses none
             torso.publish()
             time.sleep(0.01)
-        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) == 100)
-    with Skin() as skin, replaying(file, speed=0.5):
+        wait_until(lambda: recorder.messages.get("/skin/torso/frame", 0) == 60)
+    with Skin() as skin, replaying(file, speed=0.5, loop=True):
         snapshot = skin.read(timeout_s=30)
         assert snapshot.layout.drivers == ("torso",)
         assert snapshot.layout.structures == (torso.structure,)
-        assert snapshot.fresh("pressure").all()
+        assert snapshot.fresh("pressure", at_ns=int(snapshot.acquired_ns.max())).all()
         with DriverReader("torso") as reader:
             assert reader.driver_type == "fake"
             assert reader.alive

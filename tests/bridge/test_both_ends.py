@@ -77,8 +77,9 @@ def test_a_driver_is_the_same_here(ends: Ends) -> None:
                 wait_until(lambda value=value: int(there.read().values[0]) == value)  # type: ignore[misc]
                 frame = there.read()
                 assert (frame.values == value).all()
-                assert frame.fresh("pressure").all()
-                assert 0 <= frame.age_ns < 5_000_000_000
+                assert frame.fresh("pressure", at_ns=frame.acquired_ns).all()
+                assert frame.age_ns >= 0
+                assert frame.acquired_ns == pytest.approx(beside.read().acquired_ns, abs=5e9)  # the error of the clocks
 
 
 def test_every_frame_comes_and_what_is_lost_is_counted_exactly(namespace: Namespace) -> None:

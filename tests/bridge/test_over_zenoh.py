@@ -86,7 +86,7 @@ def test_two_commands_are_enough(namespace: Namespace, here: Namespace) -> None:
         assert told["clock"]["error_ms"] > 0
         with DriverReader("arm", namespace=here) as reader:
             frame = reader.read()
-            assert frame.fresh("pressure").all()
+            assert frame.fresh("pressure", at_ns=frame.acquired_ns).all()
             assert (frame.values == frame.values[0]).all()
         assert serve.wait_for("status", lambda event: "arm" in event["services"])["missed"] == 0
 

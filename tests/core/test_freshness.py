@@ -77,7 +77,7 @@ def test_a_stopped_driver_does_not_look_fresh() -> None:
     """SIGSTOP leaves the lock held and every status 0: only the age tells."""
     with fake_process("fake") as process, Skin() as skin, DriverReader("fake") as reader:
         wait_until(lambda: bool(skin.read().fresh("pressure").all()))
-        assert reader.read(max_age_s=0.5).fresh("pressure").all()
+        wait_until(lambda: bool(reader.read().fresh("pressure").all()))
         os.kill(process.pid, signal.SIGSTOP)
         time.sleep(2)
         snapshot, frame = skin.read(), reader.read()
@@ -118,11 +118,11 @@ def test_loops_wait_for_what_is_young_enough() -> None:
 def test_one_late_driver_is_named_and_can_be_left_out() -> None:
     structure = fake_structure(1, 2)
     with DriverWriter("hung", structure) as hung, DriverWriter("arm", structure) as arm, Skin() as skin:
-        publish(hung, age_ns=5 * NS_PER_S)
+        publish(hung, age_ns=90 * NS_PER_S)
         publish(arm)
         wait_until(lambda: len(skin.refresh().drivers) == 2)
-        assert skin.read().fresh("pressure", max_age_s=3).tolist() == [True] * 20 + [False] * 20
+        assert skin.read().fresh("pressure", max_age_s=60).tolist() == [True] * 20 + [False] * 20
         with pytest.raises(ServiceTimeout, match=r"too old: hung \([\d.]+ s\) \(choose others"):
-            skin.read(max_age_s=3, timeout_s=0)
+            skin.read(max_age_s=60, timeout_s=0)
         with Skin(drivers=["arm"]) as chosen:
-            assert chosen.read(max_age_s=3, timeout_s=10).layout.drivers == ("arm",)
+            assert chosen.read(max_age_s=60, timeout_s=10).layout.drivers == ("arm",)

@@ -89,7 +89,7 @@ def test_different_units_are_not_put_into_one_array() -> None:
             with pytest.raises(StructureError, match=r"snapshot\.of\('arm'\)\.physical\('pressure'\), or choose"):
                 snapshot.unit("pressure")
             assert snapshot.of("tip").physical("pressure").tolist() == [2.0, 2.0]
-            assert snapshot.fresh("pressure").all()
+            assert snapshot.fresh("pressure", max_age_s=3600).all()
             assert len(snapshot.physical("temperature")) == 6
         with Skin(drivers=["tip"]) as chosen:
             assert chosen.read(timeout_s=10).unit("pressure") == "Pa"

@@ -89,7 +89,7 @@ def test_a_calmed_driver_is_the_driver_with_zero_where_nothing_touches() -> None
             assert np.flatnonzero(frame.physical("pressure")).tolist() == [10]
             assert frame.values[12] == 50
             assert service.status()["why"]["pressure"]["held"] == 1
-            assert frame.fresh("pressure")[10]
+            assert frame.fresh("pressure", at_ns=frame.acquired_ns)[10]
             assert [list(names) for names in reader.bus_counters(frame)] == [["frames", "dropped", "errors", "unknown"]]
             with DriverReader("fake") as source:
                 newest = source.read()

@@ -24,7 +24,7 @@ def test_it_waits_for_seconds_not_for_frames_and_says_what_it_saw() -> None:
         begun = time.monotonic()
         with pytest.raises(pytest.fail.Exception) as told:
             read_until(reader, lambda frame: not frame.status.any(), 0.5)
-        assert 0.5 <= time.monotonic() - begun < 30
+        assert time.monotonic() - begun >= 0.5
     words = str(told.value)
     assert "frames of 0.5 s fulfils" in words
     assert "in the last, 41 of 96 sensors are fresh, 1 NEVER_SEEN, 52 STALE" in words

@@ -166,8 +166,8 @@ def _sent(driver: DriverSeen) -> dict[str, float]:
 _MOST_NAMES = 3
 _MOST_LINES = 6
 _STROKES = (
-    "skin-calibrate topology -o skin.toml --driver {driver}",
-    "skin-calibrate check skin.toml --driver {driver}",
+    "skin-calibrate topology {driver} -o skin.toml",
+    "skin-calibrate check skin.toml {driver}",
 )
 
 

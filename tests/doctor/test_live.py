@@ -56,7 +56,7 @@ def test_what_was_looked_at_and_what_could_not_be_is_told(skins: Skins) -> None:
     assert all(name in versions for name in ("skinware 0.1.0", "Python 3", "numpy ", "Linux "))
     not_looked = {one.what: one for one in told.not_looked}
     by_strokes = not_looked["exchanged or mirrored modules of skin"].commands
-    assert "skin-calibrate check skin.toml --driver skin" in by_strokes
+    assert "skin-calibrate check skin.toml skin" in by_strokes
     assert "these were" in not_looked["stuck taxels of skin"].why
 
 
@@ -193,7 +193,7 @@ def test_places_that_are_shared_or_missing() -> None:
     assert told["2 sensors are at places of others"].severity == Severity.WARNING
     assert told["1 sensor has no place"].severity == Severity.NOTE
     assert "triangle 0" in told["2 sensors are at places of others"].evidence
-    assert "skin-calibrate check skin.toml --driver torso" in told["1 sensor has no place"].commands
+    assert "skin-calibrate check skin.toml torso" in told["1 sensor has no place"].commands
 
 
 # -- buses ----------------------------------------------------------------------------------------------------------

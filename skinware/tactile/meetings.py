@@ -19,6 +19,8 @@ _CLOSE_WIDTHS, _CLOSE_PITCHES, _CLOSE_WAYS = 1.3, 1.2, 1.5
 """Two contacts meet when they come nearer than so many widths, pitches, or shares of their way in a sample."""
 _APART = 1.15  # they have met when they are this many times as far apart
 _GOES_ON = 3.0  # log of the odds that two contacts kept on their ways, before anything else is known
+_REST_S, _REST = 0.1, 0.5
+"""Seconds after which two have come to rest that are nearer each other than this share of their way."""
 _WANDER = 0.1  # share of its way by which a contact leaves its lane
 _LOG_RATIO = 0.3  # spread of the logarithm of the ratio of two peaks, of contacts wider than a pitch
 _MOST_OF_LOAD = 2.0  # the most that a comparison of loads counts, as a log of odds
@@ -29,39 +31,54 @@ _EXCHANGED = ("id", "born_ns", "frames", "kind", "load", "peak", "width")
 """Fields that belong to an identity, and not to a place."""
 
 
-def fit_bells(
-    value: Doubles, position: Doubles, place: Doubles, variance_m2: Doubles, peak: Doubles, width: Doubles
-) -> tuple[Doubles, Doubles, Doubles]:
-    """Fit k bells of known widths to the values of a blob, by Gauss-Newton steps from where they are expected.
+def fit_bells(value: Doubles, position: Doubles, tracks: Tracks) -> tuple[Doubles, Doubles, Doubles]:
+    """Fit a bell of known width for each of k tracks to the values of a blob, by Gauss-Newton steps.
+
+    The steps begin where the tracks are expected, and again where they were last found if that fits poorly; the better
+    fit counts. No bell is more than its width beyond the taxels.
 
     Args:
         value, position: (a,) of its taxels, and (a, 3) m, their places.
-        place, variance_m2: (k, 3) m, expected centres, and (k,) m2, how uncertain these are.
-        peak, width: (k,) expected heights, and (k,) m, the standard deviation of each bell.
+        tracks: (k,) as they are expected, but for ``found``.
 
     Returns:
         (k, 3) m, their centres, (k,) m2, the variances of these along the skin, and (k,) their heights.
     """
+    place, peak, width = tracks["place"], tracks["height"], tracks["width"]
     k = len(place)
     log_peak = np.log(np.maximum(peak, _SMALL))
-    unknown = expected = np.column_stack([place, log_peak])
-    prior = np.column_stack([np.tile(1 / variance_m2[:, None], 3), np.full(k, _LOG_PEAK**-2)]).ravel()
+    expected = np.column_stack([place, log_peak])
+    prior = np.column_stack([np.tile(1 / tracks["spread"][:, :1], 3), np.full(k, _LOG_PEAK**-2)]).ravel()
     precision: float = (_MISFIT * max(value.max(), _LEAST_VALUE * peak.max(), _SMALL)) ** -2
     most = np.column_stack([np.tile(width[:, None], 3), np.ones(k)])
-    for _ in range(_STEPS):
-        away = position[None] - unknown[:, None, :3]
-        bells = np.exp(unknown[:, 3, None] - (away**2).sum(axis=2) / (2 * width[:, None] ** 2))
-        slope = np.concatenate([bells[..., None] * away / width[:, None, None] ** 2, bells[..., None]], axis=2)
-        slope = slope.transpose(1, 0, 2).reshape(len(value), 4 * k)
-        information = precision * slope.T @ slope
-        information[np.arange(4 * k), np.arange(4 * k)] += prior
-        pull = precision * slope.T @ (value - bells.sum(axis=0)) - prior * (unknown - expected).ravel()
-        step = np.linalg.solve(information, pull).reshape(k, 4)
-        unknown = unknown + np.clip(step, -most, most)
-    covariance = np.linalg.inv(information).reshape(k, 4, k, 4)
+    best = np.inf
+    for start in (place, tracks["found"]):
+        unknown = np.column_stack([start, log_peak])
+        for step in range(_STEPS + 1):
+            near = position[((position - unknown[:, None, :3]) ** 2).sum(axis=2).argmin(axis=1)]
+            beside = unknown[:, :3] - near
+            reach = np.minimum(1, width / np.maximum(np.linalg.norm(beside, axis=1), _SMALL))
+            unknown[:, :3] = near + reach[:, None] * beside
+            away = position[None] - unknown[:, None, :3]
+            bells = np.exp(unknown[:, 3, None] - (away**2).sum(axis=2) / (2 * width[:, None] ** 2))
+            miss, change = value - bells.sum(axis=0), (unknown - expected).ravel()
+            slope = np.concatenate([bells[..., None] * away / width[:, None, None] ** 2, bells[..., None]], axis=2)
+            slope = slope.transpose(1, 0, 2).reshape(len(value), 4 * k)
+            information = precision * slope.T @ slope
+            information[np.arange(4 * k), np.arange(4 * k)] += prior
+            if step < _STEPS:
+                pull = precision * slope.T @ miss - prior * change
+                unknown = unknown + np.clip(np.linalg.solve(information, pull).reshape(k, 4), -most, most)
+        misfit = precision * float(miss @ miss)
+        cost = misfit + float(prior @ change**2)
+        if cost < best:
+            best, fitted, known = cost, unknown, information
+        if misfit < len(value):
+            break
+    covariance = np.linalg.inv(known).reshape(k, 4, k, 4)
     of_place = covariance[np.arange(k), :3, np.arange(k), :3]
     along_skin = np.asarray(np.linalg.eigvalsh(of_place)[:, :2].mean(axis=1), np.float64)  # across it, nothing is seen
-    return unknown[:, :3], along_skin, np.exp(unknown[:, 3])
+    return fitted[:, :3], along_skin, np.exp(fitted[:, 3])
 
 
 class _Meeting(NamedTuple):
@@ -75,13 +92,14 @@ class _Meeting(NamedTuple):
     drift_m2_s2: float
     log_ratio: float  # logarithm of the ratio of their peaks
     pace: Doubles  # (2, 3) m/s, their velocities
+    along_m: float  # from one to the other, along their way
 
 
 class Meetings:
     """Decides which contact is which after two have met.
 
-    That they went on, as their velocities said, is more likely than that they turned round. Against it speak their
-    lanes, the part of their distance that lies across their relative motion, and their loads.
+    That they went on, as their velocities said, is more likely than that they turned round, unless they came to rest.
+    Against it speak their lanes, the part of their distance that lies across their relative motion, and their loads.
     """
 
     def __init__(self, pitch_m: float) -> None:
@@ -134,6 +152,7 @@ class Meetings:
             drift,
             float(np.log(max(one["peak"], _SMALL) / max(other["peak"], _SMALL))),
             np.array([one["pace"], other["pace"]]),
+            float(apart @ way),
         )
 
     def end(self, tracks: Tracks, time_ns: int) -> None:
@@ -146,25 +165,32 @@ class Meetings:
             if one is None or other is None:
                 del self._open[pair]
                 continue
-            if (tracks["seen_ns"][[one, other]] != time_ns).any():
+            is_one_blob = (
+                tracks["home"][one] == tracks["home"][other]
+            )  # the fit may wander, and only one identity shows
+            if is_one_blob or (tracks["seen_ns"][[one, other]] != time_ns).any():
                 continue
             apart = tracks["found"][one] - tracks["found"][other]
             width = tracks["width"]
             if np.linalg.norm(apart) < _APART * self._close_m(width[one : one + 1], width[other : other + 1])[0]:
                 continue
+            passed_s = (time_ns - meeting.began_ns) / NS_PER_S
+            way_m = np.linalg.norm(meeting.pace[0] - meeting.pace[1]) * passed_s - abs(meeting.along_m)
+            rested = passed_s > _REST_S and abs(apart @ meeting.way) < _REST * way_m
             del self._open[pair]
-            if self._turned(meeting, apart, tracks[[one, other]], time_ns):
+            if self._turned(meeting, apart, tracks[[one, other]], passed_s, rested=rested):
                 for name in _EXCHANGED:
                     tracks[name][[one, other]] = tracks[name][[other, one]]
-                tracks["pace"][[one, other]] = meeting.pace  # as if they had exchanged their velocities
+                if not rested:
+                    tracks["pace"][[one, other]] = meeting.pace  # as if they had exchanged their velocities
 
-    def _turned(self, meeting: _Meeting, apart: Doubles, pair: Tracks, time_ns: int) -> bool:
+    def _turned(self, meeting: _Meeting, apart: Doubles, pair: Tracks, passed_s: float, *, rested: bool) -> bool:
         """Whether the two are rather those that turned round."""
-        passed_s = (time_ns - meeting.began_ns) / NS_PER_S
         drift_m2 = meeting.drift_m2_s2 * min(passed_s, meeting.duration_s) ** 2 / 4
         variance_m2 = meeting.variance_m2 + drift_m2 + float(pair["noise"].sum()) + (_WANDER * self._pitch_m) ** 2
         across = apart - meeting.way * (apart @ meeting.way)
-        odds = _GOES_ON
+        has_passed = (apart @ meeting.way) * meeting.along_m < 0
+        odds = -_GOES_ON if rested and has_passed else _GOES_ON
         if meeting.way.any():
             odds += 2 * float(across @ meeting.apart) / variance_m2
         narrow = np.clip(self._pitch_m / pair["width"].min(), 1, 3)

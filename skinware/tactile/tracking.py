@@ -30,7 +30,8 @@ _NEW_M_S, _MOST_NEW, _MOST_FAST = 1.0, 8, 32
 """m/s: spread of the velocity of a new contact. Where more begin in a frame, or more are followed, none is fast."""
 _MOST_WITHIN, _MOST_TAXELS = 4, 400
 """Tracks that a blob carries at most, and taxels of the largest blob that carries more than one."""
-_FAINT = 0.25  # a track in a blob has gone if less than this share of its peak is left
+_FAINT = 0.25  # a track in a blob has gone if less than this share of its peak is left, and its load is missing
+_PARTS_M_S = 2.0  # speed at which a contact of a blob may set off
 _PITCH_M = 0.0065  # m: pitch of taxels whose places are not known
 _REACH_PITCHES, _GATE = 2.3, 2.5
 """Pitches, or standard deviations of the expected place, by which a contact may miss it without sharing a taxel. 2.3 is
@@ -128,7 +129,7 @@ class Tracker:
         pair = track[track >= 0] * len(size) + blobs.blob[track >= 0]
         shared = np.bincount(pair, minlength=len(before) * len(size)).reshape(len(before), len(size))
         overlap = shared / np.maximum(np.minimum(before["size"][:, None], size), 1)  # as a share of the smaller one
-        home = self._homes(overlap, expected, blobs, size)
+        home = self._homes(overlap, expected, blobs, size, time_ns)
         self._meetings.begin(before, expected["place"], time_ns)
         is_joined = overlap >= 0.5
         expected["jumps"] = is_joined.sum(axis=1) > 1
@@ -158,7 +159,7 @@ class Tracker:
             self._tracks = tracks[keep]
             self.track_of[self._taxels] = number[self.track_of[self._taxels]]
 
-    def _homes(self, overlap: Doubles, expected: Tracks, blobs: TouchedBlobs, size: Whole) -> Whole:
+    def _homes(self, overlap: Doubles, expected: Tracks, blobs: TouchedBlobs, size: Whole, time_ns: int) -> Whole:
         """(tracks,) the blob of each; -1: it has gone."""
         tracks, touching = self._tracks, overlap > 0
         way_m = np.sqrt(((expected["place"] - tracks["place"]) ** 2).sum(axis=1))
@@ -170,6 +171,7 @@ class Tracker:
         known, found = assign(self._gains(overlap, expected, blobs, way_m, by_place))
         home[known] = found
         self._join(home, overlap, expected, blobs, size)
+        self._part(home, expected, blobs, time_ns)
         return home
 
     def _gains(
@@ -196,7 +198,7 @@ class Tracker:
         lost = np.flatnonzero((home < 0) & (expected["id"] > 0) & np.isfinite(expected["place"][:, 0]))
         if not len(lost) or not len(size) or len(lost) > _MOST_NEW:
             return
-        within = np.bincount(home[home >= 0], minlength=len(size))
+        before, within = self._tracks, np.bincount(home[home >= 0], minlength=len(size))
         position = self._position_m[blobs.taxels]
         for track in lost.tolist():
             squares = ((position - expected["place"][track]) ** 2).sum(axis=1)
@@ -205,7 +207,11 @@ class Tracker:
             if squares[nearest] > self._pitch_m**2:
                 blob = int(overlap[track].argmax())
                 if overlap[track, blob] < 0.5:
-                    continue
+                    mates = home[before["shared"] & before["shared"][track] & (before["home"] == before["home"][track])]
+                    mates = mates[mates >= 0]
+                    if not len(mates):
+                        continue
+                    blob = int(mates[0])
             if (
                 blobs.frame[blob] == expected["frame"][track]
                 and within[blob] < _MOST_WITHIN
@@ -213,6 +219,33 @@ class Tracker:
             ):
                 home[track] = blob
                 within[blob] += 1
+
+    def _part(self, home: Whole, expected: Tracks, blobs: TouchedBlobs, time_ns: int) -> None:
+        """Give blobs without a track one of those whose blob has too little load for all of them."""
+        carried = np.bincount(home + 1, minlength=len(blobs.load) + 1)[1:]
+        for blob in np.flatnonzero(carried > 1).tolist():
+            rows = np.flatnonzero((home == blob) & self._tracks["shared"])
+            rows = rows[self._lacks(expected[rows], blobs.load[blob])]
+            new = np.flatnonzero((carried == 0) & (blobs.frame == blobs.frame[blob]))
+            if not len(rows) or not len(new):
+                continue
+            stays, goes = (
+                ((expected["place"][rows, None] - blobs.cop_m[there]) ** 2).sum(axis=2) for there in ([blob], new)
+            )
+            passed_s = (time_ns - expected["seen_ns"][rows]) / NS_PER_S
+            reach_m = _REACH_PITCHES * self._pitch_m + _PARTS_M_S * passed_s
+            away_m = np.linalg.norm(expected["found"][rows, None] - blobs.cop_m[new], axis=2)
+            could = away_m <= reach_m[:, None]
+            if could.any():
+                one, other = np.unravel_index(np.where(could, goes - stays, np.inf).argmin(), could.shape)
+                home[rows[one]] = new[other]
+                carried[new[other]] = 1
+
+    def _lacks(self, tracks: Tracks, load: float) -> Flags:
+        """Whether each track of a blob has rather gone: its load is too small for all, as they were alone."""
+        alone = 2 * np.pi * tracks["peak"] * (tracks["width"] / self._pitch_m) ** 2
+        lacks: Flags = load < alone.sum() - alone / 2
+        return lacks
 
     def _with_new(self, tracks: Tracks, blobs: TouchedBlobs, time_ns: int) -> Tracks:
         """The tracks, and new ones of the blobs that have none."""
@@ -254,21 +287,16 @@ class Tracker:
     def _tell_apart(self, tracks: Tracks, rows: Whole, blobs: TouchedBlobs, time_ns: int) -> None:
         """Find the tracks that share a blob, each with its own bell."""
         within = np.flatnonzero(blobs.blob == tracks["home"][rows[0]])
-        place, variance_m2, peak = fit_bells(
-            blobs.value[within],
-            self._position_m[blobs.taxels[within]],
-            tracks["place"][rows],
-            tracks["spread"][rows, 0],
-            tracks["height"][rows],
-            tracks["width"][rows],
-        )
+        position_m = self._position_m[blobs.taxels[within]]
+        place, variance_m2, peak = fit_bells(blobs.value[within], position_m, tracks[rows])
         tracks["found"][rows], tracks["noise"][rows], tracks["height"][rows] = place, variance_m2, peak
         share = peak * tracks["width"][rows] ** 2
         tracks["now"][rows] = blobs.load[tracks["home"][rows[0]]] * share / share.sum()
         tracks["size"][rows] = np.maximum(1, np.round(len(within) * share / share.sum()))
         tracks["jumps"][rows] = False
         correct(tracks, rows, time_ns)
-        is_faint = peak < _FAINT * tracks["peak"][rows]
+        is_faint = self._lacks(tracks[rows], blobs.load[tracks["home"][rows[0]]])
+        is_faint &= peak < _FAINT * tracks["peak"][rows]
         is_faint[peak.argmax()] = False
         tracks["home"][rows[is_faint]] = -1
 

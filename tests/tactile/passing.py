@@ -16,7 +16,6 @@ from tests.tactile.skins import PITCH_M, placed, triangles
 Way = Literal["cross", "bounce", "meet"]
 Outcome = Literal["kept", "swapped", "new"]
 
-RATE_HZ = 50.0
 FLAT = triangles(64, 64)
 GEOMETRY = placed(FLAT)
 NEIGHBOURS = neighbours(GEOMETRY)
@@ -40,6 +39,7 @@ class FingerPass:
         lane: distance of their lanes, in pitches.
         sigma_m: width of the response to each.
         seed: for direction, place, loads and noise.
+        rate_hz: of the samples.
     """
 
     way: Way
@@ -47,6 +47,7 @@ class FingerPass:
     lane: float
     sigma_m: float
     seed: int
+    rate_hz: float = 50.0
 
     def samples(self) -> Iterator[tuple[int, npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.float64]]]:
         """Time, values, touched taxels, and (2, 3) m, where the fingers are."""
@@ -67,11 +68,11 @@ class FingerPass:
                 peak @ np.exp(-squares / (2 * self.sigma_m**2)) + NOISE * random.standard_normal(len(FLAT))
             )
             touched = counts > np.where(touched, OFF, ON)
-            yield 10**9 + round(number * 1e9 / RATE_HZ), np.where(touched, counts, 0.0), touched, at_m
+            yield 10**9 + round(number * 1e9 / self.rate_hz), np.where(touched, counts, 0.0), touched, at_m
 
     def _away_m(self, phase: float) -> npt.NDArray[np.float64]:
         """Half of the distance of both along their way, in each frame; below 0 after they have passed."""
-        step_m = self.speed_m_s / RATE_HZ
+        step_m = self.speed_m_s / self.rate_hz
         from_m = max(4 * step_m, 4 * self.sigma_m + 0.02) + phase * step_m
         if self.way != "meet":
             away_m = from_m - step_m * np.arange(round(2 * from_m / step_m) + 1)
@@ -79,10 +80,10 @@ class FingerPass:
         brake_m = self.speed_m_s**2 / (2 * BRAKE_M_S2)
         nearest_m = 0.0 if self.lane else max(WIDTHS_APART * self.sigma_m, FINGER_M) / 2
         begin_s, brake_s = from_m / self.speed_m_s, self.speed_m_s / BRAKE_M_S2
-        time_s = np.arange(0, begin_s + brake_s, 1 / RATE_HZ)
+        time_s = np.arange(0, begin_s + brake_s, 1 / self.rate_hz)
         braking_s = np.clip(time_s - begin_s, 0, brake_s)
         coming = nearest_m + from_m + brake_m - self.speed_m_s * time_s + BRAKE_M_S2 * braking_s**2 / 2
-        return np.concatenate([coming, np.full(round(REST_S * RATE_HZ), nearest_m), coming[::-1]])
+        return np.concatenate([coming, np.full(round(REST_S * self.rate_hz), nearest_m), coming[::-1]])
 
 
 @dataclass(frozen=True)
@@ -104,11 +105,8 @@ def told(one: FingerPass, contacts: Contacts | None = None) -> Verdict:
         now = _identities(found, at_m, one.sigma_m)
         if 0 not in now and now[0] != now[1]:
             first, last = first if first[0] else now, now
-    return Verdict(_moved(first, last), len(seen))
-
-
-def _moved(first: tuple[int, int], last: tuple[int, int]) -> Outcome:
-    return "new" if not first[0] else "kept" if first == last else "swapped" if first == last[::-1] else "new"
+    fate: Outcome = "new" if not first[0] else "kept" if first == last else "swapped" if first == last[::-1] else "new"
+    return Verdict(fate, len(seen))
 
 
 def _identities(found: ContactSet, at_m: npt.NDArray[np.float64], sigma_m: float) -> tuple[int, int]:

@@ -19,12 +19,8 @@ def passes(way: Way, speeds_m_s: tuple[float, ...], sigmas_m: tuple[float, ...])
     return [FingerPass(way, speed, lane, sigma, seed=0) for speed in speeds_m_s for lane in lanes for sigma in sigmas_m]
 
 
-MORE = [pytest.param(way, marks=pytest.mark.thorough) for way in WAYS[1:]]
-
-
-@pytest.mark.parametrize("way", [WAYS[0], *MORE])
-def test_identities_are_kept(way: Way) -> None:
-    found = [told(one) for one in passes(way, (0.2, 1.0), (0.004, 0.006))]
+def test_fingers_that_cross_keep_their_identities() -> None:
+    found = [told(one) for one in passes("cross", (0.2, 1.0), (0.004, 0.006))]
     outcomes = Counter(one.outcome for one in found)
     assert outcomes["swapped"] <= MOST_SWAPPED * len(found)
     assert outcomes["new"] <= MOST_NEW * len(found)
@@ -37,6 +33,13 @@ def test_identities_are_kept_at_all_speeds_and_widths() -> None:
     outcomes = Counter(one.outcome for one in found)
     assert outcomes["swapped"] <= MOST_SWAPPED * len(found)
     assert outcomes["new"] <= MOST_NEW * len(found)
+
+
+@pytest.mark.parametrize(("rate_hz", "lane"), [(50.0, 0), (50.0, 1), (50.0, 2), (100.0, 0), (100.0, 1)])
+def test_fingers_that_rest_beside_each_other_keep_both_identities(rate_hz: float, lane: int) -> None:
+    """They brake, so that they are expected beyond each other, and set off within a sample."""
+    found = [told(FingerPass("meet", 1.0, lane, 0.004, seed, rate_hz)) for seed in range(3)]
+    assert [(one.outcome, one.identities) for one in found] == 3 * [("kept", 2)]
 
 
 @pytest.mark.parametrize("sigma_m", [0.004, 0.008])

@@ -146,15 +146,15 @@ def test_lost_halves_are_all_known_and_nothing_torn_is_fresh(vcan: Callable[[], 
 
 
 def test_a_dead_board_beside_a_living_one(vcan: Callable[[], str]) -> None:
-    bus = vcan()
-    faults = ("--boards", "7,8", "--dead", "8", "--dead-after-cycles", "20")
-    with running("skin-emulate", "--bus", bus, *faults) as emulator:
-        emulator.wait_for("ready")
-        with running("skin-driver", "--bus", bus) as driver:
-            driver.wait_for("ready")
-            with DriverReader("roboskin") as reader:
-                frame = read_until(reader, lambda f: f.patch_state.tolist() == [PatchState.LIVE, PatchState.STALE])
-                assert (frame.status[192:] & Status.STALE).all()
+    on_bus = ("skin-emulate", "--bus", bus := vcan(), "--boards")
+    with running(*on_bus, "7") as living, running(*on_bus, "8") as mortal:
+        living.wait_for("ready")
+        mortal.wait_for("ready")
+        with running("skin-driver", "--bus", bus) as driver, DriverReader("roboskin", timeout_s=600) as reader:
+            read_until(reader, lambda f: f.patch_state.tolist() == [PatchState.LIVE, PatchState.LIVE])
+            mortal.stop()
+            frame = read_until(reader, lambda f: f.patch_state.tolist() == [PatchState.LIVE, PatchState.STALE])
+            assert (frame.status[192:] & Status.STALE).all()
             wait_until(lambda: "board 8 fell silent" in driver.errors)
 
 

@@ -287,7 +287,7 @@ def test_commands_that_cannot_be_carried_out_say_why_in_a_line(
 @pytest.mark.thorough
 def test_too_few_files_are_an_error_in_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (10, 10))
-    ended = refused("skin-bridge", "serve", "--robot", ROBOT, "--listen", "tcp/127.0.0.1:0")
+    ended = refused("skin-bridge", "serve", "--robot", ROBOT, "--listen", "tcp/127.0.0.1:7448")
     assert ended.returncode == 1
     assert "may open 10: raise `ulimit -n`" in ended.stderr
 

@@ -105,13 +105,14 @@ static void take_in(struct baseline *b, const float *values, const uint8_t *usab
     b->all_ready = !fresh;
 }
 
-/* How far values are from their offsets, and from when on that is a touch. A value at an end of its range shows nothing. */
+/* How far values are from their offsets, and from when on that is a touch. A value at an end of its range shows nothing, but
+ * at the lower end that an offset is not above it. */
 static void compare(struct baseline *b) {
     const struct baseline a = *b; /* no store can change it */
     const float least = (float)b->least, most = (float)b->most, on_sigma = (float)b->on_sigma;
     const float minimum = (float)least_on(b), minimum_off = (float)((double)OFF_TO_ON * least_on(b));
     const float off_sigma = (float)b->off_sigma;
-    const int has_ends = isfinite(b->most - b->least);
+    const int has_ends = isfinite(b->most - b->least), is_signed = b->is_signed != 0;
     int64_t number, i;
     for (number = 0; number < b->n_runs; number++) {
         const struct run *run = &b->runs[number];
@@ -123,7 +124,7 @@ static void compare(struct baseline *b) {
             a.deviation[i] = a.live[i] ? deviation : 0.0f;
             a.on[i] = highest(minimum, on_sigma * sqrtf(noise2 + a.variance[i] + a.gain[i] * a.gain[i] * common));
             a.off[i] = highest(minimum_off, off_sigma * sqrtf(noise2));
-            a.at_end[i] = (uint8_t)(has_ends & ((a.last[i] >= most) | (a.last[i] <= least)));
+            a.at_end[i] = (uint8_t)(has_ends & ((a.last[i] >= most) | ((a.last[i] <= least) & (is_signed | (deviation > 0)))));
         }
     }
 }

@@ -32,6 +32,7 @@ class Bench:
 
     def __init__(self, settings: BaselineSettings | None = None, noise: float = 0.8, **how: Any) -> None:
         self.baseline = Baseline(MODULE, PATCH, settings, **how)
+        self.least = how.get("limits", (-np.inf,))[0]
         self.random = np.random.default_rng(1)
         self.noise = noise
         self.level = np.full(N, 15.0)
@@ -51,7 +52,7 @@ class Bench:
         for _ in range(round(seconds * RATE_HZ)):
             self.time_ns += STEP_NS
             self.level += per_s / RATE_HZ
-            values = np.round(self.level + load + self.noise * self.random.standard_normal(N))
+            values = np.round(self.level + load + self.noise * self.random.standard_normal(N)).clip(self.least)
             self.calm = self.baseline.update(self.time_ns, values, usable, **more)
             each(self.calm)
         return self.calm
@@ -494,6 +495,20 @@ def test_a_spike_of_one_frame_is_no_touch() -> None:
         bench.run(0.02, on(5, load=100), each=lambda calm: seen.append(bool(calm.touched.any())))
         bench.run(0.3, each=lambda calm: seen.append(bool(calm.touched.any())))
     assert not any(seen)
+
+
+@pytest.mark.parametrize("noise", [0, 0.8])
+def test_a_rest_at_the_lower_end_of_the_range_is_known(noise: float) -> None:
+    """Such are values that the device tares: most of their noise is cut off."""
+    bench = Bench(noise=noise, limits=(0, 255))
+    bench.level[:] = 0
+    bench.run(6)
+    for _ in range(6):
+        assert bench.run(3, on(3, 4) + on(30)).touched[[3, 4, 30]].all()
+        bench.run(1.5)
+        rest: list[npt.NDArray[np.bool_]] = []
+        bench.run(5, each=lambda calm: rest.append((calm.why == Why.REST) & (np.abs(calm.baseline) < 0.5)))
+        assert np.mean(rest) > 0.99
 
 
 def test_a_touched_value_at_the_end_of_the_range_may_be_more() -> None:

@@ -182,6 +182,15 @@ def test_patches_that_step_as_a_whole_and_gaps(seed: int) -> None:
     both.compare_states()
 
 
+def test_values_that_rest_at_the_lower_end_of_their_range() -> None:
+    both, random = Both(np.arange(N) // 12, np.arange(N) // 48, limits=(0.0, 60.0)), np.random.default_rng(1)
+    for number in range(900):
+        load = 80 * ((number % 150 > 90) & (np.arange(N) % 12 < 3))
+        values = 3 * np.sin(number / 100) + load + 0.7 * random.standard_normal(N)
+        both.update((number + 1) * 50_000_000, np.round(values.clip(0, 60)))
+    both.compare_states()
+
+
 def test_patches_of_few_taxels() -> None:
     patch, random = np.array([0, 1, 1, 2, 2, 2, 3, 3, 3, 3]), np.random.default_rng(1)
     both = Both(patch, patch)

@@ -139,6 +139,7 @@ class SpecifiedBaseline:
         self._fall, self._fell_s = np.zeros((2, self._offsets.patches.n))
         """By how much each patch jumped down of late, and how long ago."""
         self._forced: Flags = np.zeros(n, bool)
+        self._at_end: Flags | np.bool_ = np.False_
         self._suspect: Flags | None = None
         self._normal: SpecifiedBaseline | None = None
         self._live, self._off = np.zeros(n, bool), np.zeros(n, np.float32)
@@ -239,12 +240,13 @@ class SpecifiedBaseline:
             self._measure(time_ns, usable, passed_s)
         live = self._live = usable & self._ready
         deviation = np.where(live, intake.last - offsets.level - touches.remainders.left, np.float32(0))
+        self._at_end = self._find_ends(deviation)
         spread = np.sqrt(offsets.noise2)
         on = np.maximum(self._minimum_on, settings.on_sigma * np.sqrt(offsets.total())).astype(np.float32)
         off = self._off = np.maximum(OFF_TO_ON * self._minimum_on, settings.off_sigma * spread).astype(np.float32)
         if not touches.signed:
             self._jump(deviation, live, off, passed_s)
-        free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end()
+        free = live & ~touches.touched & touches.remainders.has_settled & ~self._at_end
         if not touches.signed:
             low = touches.smooth < -settings.off_sigma * spread
             free &= ~self._falls.sagging & ~(self._falls.below & low) & (self._falls.lowered <= 0)
@@ -268,7 +270,7 @@ class SpecifiedBaseline:
             if not touches.signed:
                 settled |= touches.smooth < -off  # no touch leaves less than 0
             learns = live & ~touches.touched & ~self._falls.sagging & settled
-            learns &= (touches.load(deviation) < on) & ~self._at_end()  # a touch that begins is no drift
+            learns &= (touches.load(deviation) < on) & ~self._at_end  # a touch that begins is no drift
             rustles = (np.abs(touches.smooth) < rustle) & (np.abs(deviation) < off)
             learns &= ~self._surroundings.beside | rustles
             calm = learns & (np.abs(touches.smooth) < rustle)
@@ -285,13 +287,16 @@ class SpecifiedBaseline:
             return given
         return self._resolution * (0.5 if self._intake.few_levels else STEPS_OF_A_TOUCH)
 
-    def _at_end(self) -> Flags | np.bool_:
-        """Return (n,) which taxels are at an end of their range: they show no drift and no more load."""
+    def _find_ends(self, deviation: Floats) -> Flags | np.bool_:
+        """Return (n,) which taxels are at an end of their range: they show no drift and no more load.
+
+        At the lower end they show that their offset is not above it.
+        """
         least, most = self._limits
         if not math.isfinite(most - least):
             return np.False_
         last = self._intake.last
-        at_end: Flags = (last >= most) | (last <= least)
+        at_end: Flags = (last >= most) | ((last <= least) & (self._touches.signed | (deviation > 0)))
         return at_end
 
     def _least_noise2(self, level: Floats) -> Floats | np.float32:
@@ -324,7 +329,7 @@ class SpecifiedBaseline:
     def _jump(self, deviation: Floats, live: Flags, off: Floats, passed_s: float) -> None:
         """Move the offsets of patches whose free taxels fell alike and at once, returned, or moved in a gap."""
         offsets, touches, patches = self._offsets, self._touches, self._offsets.patches
-        free = live & ~self._at_end() & (~touches.touched | (touches.contact_s < np.float32(2 * LOOK_AT_S)))
+        free = live & ~self._at_end & (~touches.touched | (touches.contact_s < np.float32(2 * LOOK_AT_S)))
         number = patches.sum(free)
         most = NEARLY_ALL * number
         self._fell_s += passed_s
@@ -421,7 +426,7 @@ class SpecifiedBaseline:
         why[~self._ready | (offsets.variance > offsets.noise2) & ~touches.touched] = Why.RELEARNING
         why[low] = Why.COVERED
         why[self._falls.returned > 0] = Why.DOUBTED
-        why[touches.touched & self._at_end()] = Why.SATURATED
+        why[touches.touched & self._at_end] = Why.SATURATED
         if self._intake.few_levels:
             why[live] = Why.NO_RESOLUTION
         forced, self._forced = self._forced, np.zeros(len(live), bool)

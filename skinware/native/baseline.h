@@ -111,7 +111,6 @@ struct module {
     double begun_s; /* how long ago the newest touch began on it */
     double touched; /* number of its taxels */
     double near;    /* 1: something touches it */
-    double rises;   /* 1: a new touch is on it, and not where the taxel fell from */
     double looked;  /* a touch on it is looked at: touches.c has when */
     double median, onset, slow, on, off, number, alike; /* of a module that is looked at */
     double living, speed2; /* number of its taxels with values, sum of the squares of their speeds */

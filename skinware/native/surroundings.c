@@ -150,16 +150,10 @@ void follow_falls(struct baseline *b, float rustle_share, double passed_s) {
     }
 }
 
-/* Whether a taxel is where it fell from of late. */
-static int is_at_dip(const struct baseline *b, int64_t i) {
-    return b->dip[i] > 0 && fabsf(b->smooth[i] - b->dip[i]) < b->on[i];
-}
-
-/* Returns whether a new touch is none: the taxel returns to where it fell from, or sagged from. Where others of its module
- * rise with it, it is pressed again as it was at the start. */
+/* Returns whether a new touch is none: the taxel returns to where it fell from, or sagged from. */
 static int is_return(struct baseline *b, int64_t i) {
     const float smooth = b->smooth[i], on = b->on[i], old_s = (float)b->modules[b->module[i]].old_s;
-    if (!b->felt[i] && is_at_dip(b, i) && !b->modules[b->module[i]].rises) {
+    if (!b->felt[i] && b->dip[i] > 0 && fabsf(smooth - b->dip[i]) < on) {
         b->returned[i] = (uint8_t)(b->returned[i] + (b->returned[i] < 255));
         b->dip[i] = 0;
         return 1;
@@ -172,23 +166,17 @@ static int is_return(struct baseline *b, int64_t i) {
 void return_from_falls(struct baseline *b, double passed_s) {
     const struct baseline a = *b; /* no store can change it */
     int64_t i, k;
-    for (k = 0; k < b->n_modules; k++) {
+    for (k = 0; k < b->n_modules; k++)
         b->modules[k].old_s += passed_s;
-        b->modules[k].rises = 0;
-    }
     for (i = 0; i < b->n; i++) {
         a.dip_s[i] += (float)passed_s;
         a.dip[i] = a.dip_s[i] > DIP_S ? 0.0f : a.dip[i];
     }
-    for (k = 0; k < b->n_touched; k++) {
-        struct module *m = &b->modules[a.module[i = b->list[k]]];
-        if (a.touched[i] && a.contact_s[i] < 2 * LOOK_AT_S && !is_at_dip(b, i))
-            m->rises = 1;
-        if (is_looked_at(b, i, passed_s) == 2) {
-            m->old_s = 0;
+    for (k = 0; k < b->n_touched; k++)
+        if (is_looked_at(b, i = b->list[k], passed_s) == 2) {
+            b->modules[a.module[i]].old_s = 0;
             a.felt[i] = 1;
         }
-    }
     for (k = 0; k < b->n_touched; k++)
         if (is_looked_at(b, i = b->list[k], passed_s) == 1 && is_return(b, i)) {
             put(b, i, a.smooth[i]);

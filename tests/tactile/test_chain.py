@@ -268,7 +268,7 @@ def test_axes_within_the_skin_bear_no_load_without_one_along_the_normal(axes: tu
     run(0, 6, -0.6 * pressed, 0.5 * pressed, pressed)
     run(6, 9)
     assert not run(9, 12).any()
-    pressed = 60.0 * (np.abs(np.arange(n) - 7) < 3)
+    pressed = 45.0 * (np.abs(np.arange(n) - 7) < 3)
     beside = 12.0 * (np.arange(n) == 11)
     touched = run(12, 40, 0.4 * pressed + beside, -0.7 * pressed, pressed)
     assert touched[:, pressed > 0].min() > 0.98

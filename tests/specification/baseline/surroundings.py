@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from tests.specification.baseline.numbers import DIP_S, LOOK_AT_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
+from tests.specification.baseline.numbers import DIP_S, SAG_RETURNS_BY, SAG_RETURNS_S, SAG_SHARE
 from tests.specification.baseline.offsets import Grouping
 from tests.specification.baseline.touches import Touches
 
@@ -161,12 +161,9 @@ class Falls:
         if not looked.any():
             return np.zeros(0, np.intp)
         rows = np.flatnonzero(looked)
-        is_at_dip = (self._dip > 0) & (np.abs(touches.smooth - self._dip) < on)
-        rises = np.zeros(self._around.n_modules, bool)
-        rises[self._around.module[touches.touched & (touches.contact_s < np.float32(2 * LOOK_AT_S)) & ~is_at_dip]] = (
-            True
+        returns = (
+            ~self._felt[rows] & (self._dip[rows] > 0) & (np.abs(touches.smooth[rows] - self._dip[rows]) < on[rows])
         )
-        returns = ~self._felt[rows] & is_at_dip[rows] & ~rises[self._around.module[rows]]
         dipped = rows[returns]
         self.returned[dipped] = np.minimum(self.returned[dipped], 254) + 1
         self._dip[dipped] = 0

@@ -122,6 +122,7 @@ class ZenohLink:
 
     def __init__(self, endpoints: Endpoints) -> None:
         self._session = open_session(endpoints)
+        self.zid: str = str(self._session.info.zid())
         self._declared: list[Any] = []
 
     def sender(self, key: str) -> Sender:

@@ -65,6 +65,8 @@
 #define USED_S 40.0           /* seconds in which the material gets used to a load, and forgets it */
 #define RESETTLE_S 3.0        /* seconds in which a taxel finds back after a load, instead of tau_s */
 #define FADED 0.75f           /* share: what is left after a sudden fall, and fades below this, was a remainder */
+#define HEATS 0.003f          /* share of the largest present load in the patch: its heat and sweat raise other taxels by so much a second */
+#define HEATS_ON 0.25f        /* share of that load: with a higher threshold, a rise below it may be a touch */
 #define MOST_REMAINDER 0.35f  /* share of a load: no cover keeps more of it */
 #define LEFT_AT_S 3.0f        /* seconds after a sudden fall at which it is noted how much is left */
 #define SETTLED_S 1.0f        /* seconds after the end of a touch at which the rest of it is known */
@@ -96,6 +98,7 @@ struct patch {
     double drift;     /* variance that the offset of a taxel gains in a second by a drift of its own */
     double wander;    /* square of how far a typical taxel at rest is from its offset, over some seconds */
     double largest;   /* load of a touch, now or a moment ago */
+    double present;   /* the largest load now */
     double since_s;   /* the last touch */
     double share;     /* of a load that its cover keeps */
     double moves2;    /* by how much the mode moves from frame to frame, squared, as measured at rest */

@@ -297,6 +297,7 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
     for (number = 0; passed_s > 0 && number < b->n_runs; number++) {
         const struct run *run = &b->runs[number];
         const float grows = (float)b->patches[run->patch].drift * (float)passed_s;
+        const float load_now = (float)b->patches[run->patch].present, common = (float)b->patches[run->patch].variance;
         const int64_t first = run->first, last = run->last;
         INDEPENDENT
         for (i = first; i < last; i++) {
@@ -311,7 +312,11 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
         INDEPENDENT
         for (i = first; i < last; i++) { /* beside a touch a rise may be its load, also one that is not smoothed yet; falls alone would be noise */
             const int rustles = (fabsf(a.smooth[i]) < rustle_share * a.off[i]) & (fabsf(a.deviation[i]) < a.off[i]);
-            a.flag[i] &= (a.settling_s[i] < beside_s) | rustles;
+            const int is_measured = (a.settling_s[i] < beside_s) | rustles;
+            const float unsure2 = a.gain[i] * a.gain[i] * common, on = a.on[i];
+            const int rises = !a.is_signed & (a.smooth[i] > 0.5f * on) & (on < HEATS_ON * load_now) & (unsure2 < a.noise2[i]);
+            a.scratch[i] = a.flag[i] & rises ? HEATS * load_now * passed : 0.0f;
+            a.flag[i] &= is_measured;
         }
         INDEPENDENT
         for (i = first; i < last; i++) {
@@ -329,7 +334,7 @@ void learn(struct baseline *b, float rustle_share, double passed_s) {
             const float known_s = lowest(a.noise_s[i] + (is_calm ? passed : 0.0f), NOISE_S);
             const float of_square = lowest(passed / known_s, FEWEST);
             const float away = innovation - slow, slower = slow + away * (is_measured ? slowly : 0.0f);
-            a.level[i] += share * innovation;
+            a.level[i] += share * innovation + lowest(highest(a.deviation[i], 0.0f), a.scratch[i]);
             a.gain[i] += of_gain * innovation;
             a.gain_variance[i] -= of_gain * cross;
             a.cross[i] = cross * keep;

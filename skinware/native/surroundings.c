@@ -22,6 +22,7 @@ void hold_near(struct baseline *b, double passed_s) {
         struct patch *p = &b->patches[k];
         p->since_s += passed_s;
         p->largest = p->since_s > fmax(b->settle_s, 1e-9) ? 0 : p->largest;
+        p->present = 0;
     }
     for (k = 0; k < b->n_modules; k++)
         b->modules[k].near = 0;
@@ -30,7 +31,8 @@ void hold_near(struct baseline *b, double passed_s) {
         if (!b->touched[i] || !b->live[i])
             continue;
         p->since_s = 0;
-        p->largest = fmax(p->largest, (double)b->smooth[i]);
+        p->present = fmax(p->present, (double)b->smooth[i]);
+        p->largest = fmax(p->largest, p->present);
         b->modules[b->module[i]].near = 1;
     }
     for (i = 0, b->is_near = 0; i < b->n; i++) {

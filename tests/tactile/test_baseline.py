@@ -757,6 +757,18 @@ def test_load_beside_a_touch_moves_no_uncertain_offset() -> None:
     assert abs(bench.calm.baseline[5] - 15) < 12
 
 
+@pytest.mark.parametrize("noise", [0.3, 0.8, 2.0])
+def test_heat_and_sweat_beside_a_grip_are_no_touch_but_a_press_there_is(noise: float) -> None:
+    bench = Bench(noise=noise)
+    bench.run(6)
+    for risen in np.linspace(0, 48, 60 * RATE_HZ):
+        bench.run(1 / RATE_HZ, on(0, 1, 2, load=400) + on(3, 4, 5, 6, load=risen))
+        assert not bench.calm.touched[3:].any()
+    bench.run(1, on(0, 1, 2, load=400) + on(3, 4, 5, 6, load=48) + on(4))
+    assert np.flatnonzero(bench.calm.touched).tolist() == [0, 1, 2, 4]
+    assert bench.calm.value[4] == pytest.approx(25, abs=8)
+
+
 def test_load_that_moves_to_other_taxels_as_a_grip_loosens_is_no_remainder() -> None:
     bench = Bench()
     bench.run(6)

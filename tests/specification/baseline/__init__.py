@@ -34,6 +34,8 @@ from tests.specification.baseline.numbers import (
     FEW_LEVELS,
     FORGET_AFTER_S,
     GAP_S,
+    HEATS,
+    HEATS_ON,
     LOOK_AT_S,
     MANY_TAXELS,
     NEARLY_ALL,
@@ -271,10 +273,15 @@ class SpecifiedBaseline:
                 settled |= touches.smooth < -off  # no touch leaves less than 0
             learns = live & ~touches.touched & ~self._falls.sagging & settled
             learns &= (touches.load(deviation) < on) & ~self._at_end  # a touch that begins is no drift
+            load_now = self._surroundings.present[self._surroundings.patch]
+            heats = learns & (touches.smooth > np.float32(0.5) * on) & (on < np.float32(HEATS_ON) * load_now)
+            heats &= offsets.gain * offsets.gain * offsets.patches.spread(offsets.common.variance) < offsets.noise2
+            heats &= not touches.signed
+            rises = np.where(heats, np.float32(HEATS) * load_now * np.float32(passed_s), np.float32(0))
             rustles = (np.abs(touches.smooth) < rustle) & (np.abs(deviation) < off)
             learns &= ~self._surroundings.beside | rustles
             calm = learns & (np.abs(touches.smooth) < rustle)
-            offsets.learn(deviation, learns, calm, touches.remainders.used <= 0, live, floor, passed_s)
+            offsets.learn(deviation, learns, calm, touches.remainders.used <= 0, live, floor, rises, passed_s)
             np.maximum(offsets.noise2, self._least_noise2(offsets.level), out=offsets.noise2)
         if not touches.signed:
             touches.remainders.follow(deviation, touches.smooth, touches.touched, on, passed_s)

@@ -233,6 +233,7 @@ class Offsets:
         fresh: Flags,
         live: Flags,
         floor: Floats | np.float32,
+        rises: Floats,
         passed_s: float,
     ) -> None:
         """Correct offsets and gains by the deviations of taxels at rest; let the others become less certain.
@@ -244,6 +245,7 @@ class Offsets:
             fresh: (n,) those that have not got used to a load: only they say something of the speed of drift.
             live: (n,) those with values and offsets.
             floor: least share of a deviation that the offset follows where it drifts by itself.
+            rises: (n,) by how much heat and sweat of a touch may have raised each since the last frame.
             passed_s: since the last frame.
         """
         if passed_s <= 0:
@@ -260,7 +262,7 @@ class Offsets:
         share = self.variance / total
         share = np.where(taxels, np.where(drifts, np.maximum(share, floor), share), np.float32(0))
         of_gain = np.where(calm & (unlike < np.float32(4 * DRIFT_SIGMA**2)), self.cross / total, np.float32(0))
-        self.level += share * innovation
+        self.level += share * innovation + np.minimum(np.maximum(deviation, 0), rises)
         self.gain += of_gain * innovation
         self.gain_variance -= of_gain * self.cross
         keep = np.float32(1) - share

@@ -28,13 +28,15 @@ class Surroundings:
         is_back: (n,) bool, nothing touches the patch, and its cover has had the time to come back.
         held: (n,) bool, the taxels that are near a contact, or were in the last ``settle_s``.
         beside: (n,) bool, those of them that are near one now.
-        largest: (n_patches,) the largest load of each patch.
+        largest: (n_patches,) the largest load of each patch, now or a moment ago.
+        present: (n_patches,) the largest load now.
     """
 
     def __init__(self, module: Rows, patch: Rows) -> None:
         self.module, self.patch = module, patch
         self.n_modules = int(module.max(initial=-1)) + 1
         self.largest: Floats = np.zeros(int(patch.max(initial=-1)) + 1, np.float32)
+        self.present: Floats = np.zeros_like(self.largest)
         self.busy: Flags = np.zeros(len(module), bool)
         self.is_back: Flags = np.ones(len(module), bool)
         self.held: Flags = np.zeros(len(module), bool)
@@ -50,11 +52,12 @@ class Surroundings:
         np.maximum(self._settling_s - np.float32(passed_s), 0, out=self._settling_s)
         self._since_s += passed_s
         over = self._since_s > max(settle_s, 1e-9)
-        self.largest[over] = 0
+        self.largest[over] = self.present[:] = 0
         if len(active):
             patch = self.patch[active]
             self._since_s[patch] = 0
-            np.maximum.at(self.largest, patch, touches.smooth[active])
+            np.maximum.at(self.present, patch, touches.smooth[active])
+            np.maximum(self.largest, self.present, out=self.largest)
             self._settling_s[self._near(active)] = max(settle_s, 1e-6)
         self.busy = (self._since_s <= settle_s)[self.patch]
         self.is_back = (self._since_s.astype(np.float32) > np.float32(SAG_RETURNS_S))[self.patch]

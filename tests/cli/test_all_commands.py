@@ -47,7 +47,8 @@ def test_alone_it_prints_its_help_where_it_needs_to_be_told_what_to_do(
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_an_unknown_option_is_wrong_usage(name: str) -> None:
-    assert refused(name, "--nonesuch").returncode == EXIT_USAGE
+    wrong = refused(name, "--nonesuch")
+    assert (wrong.returncode, "--nonesuch" in wrong.stderr) == (EXIT_USAGE, True)
 
 
 MISSING = {

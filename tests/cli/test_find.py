@@ -210,6 +210,7 @@ def test_an_emulator_does_not_stand_in_the_way_at_its_own_port(
         (["virtual?board=7"], 2, "did you mean 'boards'"),
         (["nonsense:0"], 2, "no interface 'nonsense'"),
         (["--force"], 2, "--probe"),
+        (["-T", "-1"], 2, "seconds"),
         (["--udev", "can0"], 2, "not a serial port"),
         (["serial:?serial_number=A5"], 1, "there is no serial port"),
         (["tcp://127.0.0.1", "--probe"], 2, "bus tcp://127.0.0.1: which port? Write tcp://HOST:PORT"),

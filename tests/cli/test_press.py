@@ -94,6 +94,11 @@ def test_of_several_one_must_be_named(capsys: pytest.CaptureFixture[str]) -> Non
         assert pressed(capsys, "0.07", "0.0225", "0", "--name", "two").startswith("two on ")
 
 
+@pytest.mark.parametrize("arguments", [["0", "0"], ["0", "0", "up"], ["0", "0", "0", "--newtons", "hard"]])
+def test_wrong_usage_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert "Usage: skin-press" in pressed(capsys, *arguments, status=2)
+
+
 def test_an_emulator_without_places_has_no_service(capsys: pytest.CaptureFixture[str], namespace: Namespace) -> None:
     for option in ("--name", "--geometry"):
         arguments = ["--driver", "xela", "--bus", BUS, option, "hand"]

@@ -54,6 +54,7 @@ def test_a_command_runs_as_by_its_own_name() -> None:
         ("skin", "skin re", "record"),
         ("skin", "skin top --na", "--namespace"),
         ("skin-top", "skin-top --na", "--namespace"),
+        ("skin-driver", "skin-driver --listen", "--listen-only"),
         ("skin-record", "skin-record --ou", "--output"),
     ],
 )

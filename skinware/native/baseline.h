@@ -55,6 +55,8 @@
 #define FIRST_DRIFT 1e-4      /* times the variance of noise, a second: drift of its own, before a patch showed it */
 #define LEAST_DRIFT 1e-6      /* the same, at least: from less, it takes minutes until a new drift is believed */
 #define MOST_DRIFT 1e-1       /* the same, at most: with more, noise is followed */
+#define HEATS 0.003f          /* share of the largest present load in the patch: its heat and sweat raise other taxels by so much a second */
+#define HEATS_ON 0.25f        /* share of that load: with a higher threshold, a rise below it may be a touch */
 #define WANDER_S 10.0         /* seconds over which errors of offsets at rest, and speeds of own drift, are averaged */
 #define TICK_S 1.0            /* seconds between adjustments of what changes slowly */
 
@@ -65,8 +67,6 @@
 #define USED_S 40.0           /* seconds in which the material gets used to a load, and forgets it */
 #define RESETTLE_S 3.0        /* seconds in which a taxel finds back after a load, instead of tau_s */
 #define FADED 0.75f           /* share: what is left after a sudden fall, and fades below this, was a remainder */
-#define HEATS 0.003f          /* share of the largest present load in the patch: its heat and sweat raise other taxels by so much a second */
-#define HEATS_ON 0.25f        /* share of that load: with a higher threshold, a rise below it may be a touch */
 #define MOST_REMAINDER 0.35f  /* share of a load: no cover keeps more of it */
 #define LEFT_AT_S 3.0f        /* seconds after a sudden fall at which it is noted how much is left */
 #define SETTLED_S 1.0f        /* seconds after the end of a touch at which the rest of it is known */

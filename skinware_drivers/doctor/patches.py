@@ -165,10 +165,6 @@ def _sent(driver: DriverSeen) -> dict[str, float]:
 
 _MOST_NAMES = 3
 _MOST_LINES = 6
-_STROKES = (
-    "skin-calibrate topology {driver} -o skin.toml",
-    "skin-calibrate check skin.toml {driver}",
-)
 
 
 def check_taxels(evidence: Evidence) -> Iterator[Note]:
@@ -232,7 +228,7 @@ def _health(driver: DriverSeen) -> Iterator[Note]:
 def _places(driver: DriverSeen) -> Iterator[Note]:
     structure = driver.structure
     swapped = f"exchanged or mirrored modules of {driver.name}"
-    by_strokes = tuple(command.format(driver=driver.name) for command in _STROKES)
+    by_strokes = RULES["place"]["unknown"].advised(driver=driver.name)
     if structure.geometry is None:
         yield NotLooked(swapped, "the driver publishes no places of its sensors", by_strokes)
         return

@@ -79,13 +79,17 @@ class Rule:
 
     def found(self, where: str, evidence: str, severity: Severity | None = None, /, **names: object) -> Finding:
         """Return a finding of this kind; the names are filled in, quoted for a shell in commands."""
+        what, commands = self.what.format_map(names), self.advised(**names)
+        return Finding(severity or self.severity, what, where, evidence, self.action, commands, self.see)
+
+    def advised(self, **names: object) -> tuple[str, ...]:
+        """Return the commands whose names are given, filled in and quoted for a shell."""
         quoted = {name: shlex.quote(str(value)) for name, value in names.items()}
         commands = []
         for command in self.commands:
             with contextlib.suppress(KeyError):
                 commands.append(command.format_map(quoted))
-        what = self.what.format_map(names)
-        return Finding(severity or self.severity, what, where, evidence, self.action, tuple(commands), self.see)
+        return tuple(commands)
 
 
 def _read() -> dict[str, dict[str, Rule]]:

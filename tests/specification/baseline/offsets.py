@@ -49,11 +49,16 @@ class Grouping:
 
     Args:
         group: (n,) int, the group of each value, 0 or more.
+
+    Attributes:
+        n: number of groups.
+        size: (n_groups,) how many values each has.
     """
 
     def __init__(self, group: Rows) -> None:
         self.group = group
         self.n = int(group.max(initial=-1)) + 1
+        self.size = self.sum(np.ones(len(group), bool))
 
     def sum(self, values: npt.NDArray[np.bool_ | np.integer[Any] | np.floating[Any]]) -> Doubles:
         """Return (n_groups,) the sums of (n,) values, one after the other."""
@@ -164,7 +169,6 @@ class Offsets:
         self.noise_s: Floats = np.full(n, NOISE_S, np.float32)
         self.patches = Grouping(patch)
         self.common = CommonMode(self.patches.n)
-        self._many = self.patches.sum(np.ones(n, bool)) > FEW_TAXELS
         self.agility, self.typical, self.wander, self._speed2 = np.zeros((4, self.patches.n))
         self._modules = Grouping(module)
         self.rate2 = np.zeros(self._modules.n)
@@ -204,7 +208,7 @@ class Offsets:
         if passed_s <= 0:
             return
         mode = self.common
-        mode.variance = np.where(self._many, mode.variance + mode.agility * passed_s, 0)
+        mode.variance = np.where(self.patches.size > FEW_TAXELS, mode.variance + mode.agility * passed_s, 0)
         typical = self.patches.spread(self.typical)
         free = free & (self.noise2 >= np.float32(QUIET) * typical)
         own = np.maximum(self.noise2, typical) + self.variance

@@ -68,7 +68,6 @@ class Rest:
         self.refused_share = 0.0
         self.moves2 = np.zeros(patches.n)
         self._patches = patches
-        self._many = patches.sum(np.ones(len(patches.group), bool)) > FEW_TAXELS
         self._clear()
 
     def _clear(self) -> None:
@@ -120,7 +119,8 @@ class Rest:
             self._begun_ns = time_ns
         np.copyto(self._first, values, where=usable & np.isnan(self._first))
         difference = np.where(usable, values - self._first, np.float32(0))  # small, so that its squares are exact
-        before, self._common = self._common, self._patches.median(difference, usable) * self._many
+        before, median = self._common, self._patches.median(difference, usable)
+        self._common = median * (self._patches.size > FEW_TAXELS)
         if self._frames:
             self.moves2 += ((self._common - before) ** 2 - self.moves2) / 20
         common = self._patches.spread(self._common) * usable
